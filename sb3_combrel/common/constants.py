@@ -29,6 +29,10 @@ DISCOUNT, WORTH_TRYING = 0.99, 1.0
 # Scales that are found: what an observation may lie beyond them by, in parts of the range; and a range that is more times as
 # wide as what is observed is too wide: CartPole, Acrobot, dm_control's pendulum.
 BEYOND, TOO_WIDE = 0.05, 2.0
+# Where a task goes on for ever, the lines of a grid of so many cells of a variable, or fewer, are where its values are wrong.
+# Whenever instances are so many times as many, lines go this part of the way there; of their density this part is even, and
+# errors are counted in so many bins of an even cell: dm_control's cart-pole.
+COARSE, LINES_AGAIN, LINE_STEP, EVENLY, BINS_A_CELL = 8, 1.1, 0.25, 0.1, 4
 # Grid points are known with this fraction of the weight that exact states need, once an episode has ended or rewards have
 # differed: nobody gets to those that lie beyond all data, and they would draw the agent for ever. Until then to know how
 # states change is not to know what is there: dm_control's pendulum, point robot.

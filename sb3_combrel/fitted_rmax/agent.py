@@ -17,7 +17,13 @@ from typing import Any
 import numpy as np
 
 from sb3_combrel.common.checks import check_resolution
-from sb3_combrel.common.constants import LONGEST_PLAN, SWEEPS_A_STEP, SWEEPS_AT_EPISODE_END
+from sb3_combrel.common.constants import (
+    COARSE,
+    LINES_AGAIN,
+    LONGEST_PLAN,
+    SWEEPS_A_STEP,
+    SWEEPS_AT_EPISODE_END,
+)
 from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task
@@ -29,6 +35,7 @@ from sb3_combrel.fitted_rmax.settings import MODELS, FittedRMaxSettings
 from sb3_combrel.fitted_rmax.workload import warn_if_long, workload
 from sb3_combrel.models.base import NO_PAIRS, Model
 from sb3_combrel.planning.grid import fitting_grid
+from sb3_combrel.planning.lines import moved_lines
 from sb3_combrel.planning.mdp import FiniteMDP
 from sb3_combrel.planning.planner import Planner
 from sb3_combrel.planning.q_values import Prediction, QValues, ValueFunction
@@ -81,6 +88,9 @@ class FittedRMaxAgent:
         self.workload = workload(self.grid, task.n_actions, self.model_settings, self._method.informs_model)
         warn_if_long(self.workload, self.grid)
         self.rewards = RewardRange(settings.gamma, settings.max_value)
+        #: Whether the grid is so coarse that it matters where its lines are; with how many instances they are moved next.
+        self.is_coarse = self.grid.margin == 0 and 2 ** max(self.grid.resolution) <= COARSE
+        self._lines_due = self.model_settings.n_neighbors * task.n_actions
         self.n_sweeps = 0
         #: Whether it has learned from what it has done itself.
         self.has_acted = False
@@ -127,7 +137,7 @@ class FittedRMaxAgent:
         self.model = self.model_class(self.mdp, self.model_settings, self._asked)
         bounds = {"max_value": max_value, "min_value": min(0.0, max_value) - 1.0}
         self.planner = Planner(self.mdp, **bounds, tolerance=tolerance, follows_changes=self.model.follows_changes)
-        self.promises = Promises(self.grid.arrays, self.task.n_actions)
+        self.promises = Promises(self.grid, self.task.n_actions)
         self._prior_version = -1
         # Pairs whose rows are to be updated: an interrupt in between loses none.
         self._outdated: list[np.ndarray] = []
@@ -209,6 +219,7 @@ class FittedRMaxAgent:
             self.promises.pay(environment, reward, self.mdp.gamma)
             self._take_in(state, action, reward, next_state, terminated)
             self._plan(SWEEPS_A_STEP)
+            self._move_lines()
 
     def end_episode(self, truncated: bool, environment: int = 0) -> None:
         """Plan on while no action is due.
@@ -357,6 +368,7 @@ class FittedRMaxAgent:
             self._follow_rewards()
             self._take_in_all(transitions)
             self._plan(SWEEPS_AT_EPISODE_END)
+            self._move_lines()
 
     def _take_in_all(self, transitions: Sequence[Transition], observed: bool = False) -> None:
         """Give past transitions to model and transfer method; all pairs that they change are outdated.
@@ -372,15 +384,32 @@ class FittedRMaxAgent:
                 self._method.end_episode(truncated=False)
         self._outdated = [self.model.outdated()]
 
-    def rescale(self, scaling: StateScaling, bounds: StateScaling) -> None:
+    def _move_lines(self) -> None:
+        """Move the lines of a coarse grid to where values between them are wrong, whenever experience has grown by a tenth.
+
+        That is by how much a value interpolated at a state differs from the best action's there; the latter half of the
+        experience counts. Where there is an end to come to, lines stay: no place is for staying.
+        """
+        n = self.model.n_instances if self.is_coarse and self.rewards.for_ever else 0
+        if n < self._lines_due:
+            return
+        states, values = [state for state, *_ in self.model.transitions()[n // 2 :]], self.planner.values
+        errors = [abs(self.grid.interpolate(values, state) - self.q_values(state).max()) for state in states]
+        if max(errors) > 0.0:
+            lines = moved_lines(self.grid, np.array(states), np.array(errors))
+            self.rescale(self.task.scaling, self.task.shared_scaling, lines)
+        self._lines_due = int(np.ceil(LINES_AGAIN * n))
+
+    def rescale(self, scaling: StateScaling, bounds: StateScaling, lines: np.ndarray | None = None) -> None:
         """Compute all anew in other unit coordinates; an interrupt, or an error, leaves all as it was.
 
         :param scaling: raw <-> unit coordinates from now on; ``bounds``: as of :class:`~sb3_combrel.common.task.Task`
+        :param lines: of the grid; None: as they are
         """
         with self.lock:
             attributes, generator, of_transfer = dict(vars(self)), self.rng.bit_generator.state, self._method.get_state()
             try:
-                self._rescale(scaling, bounds)
+                self._rescale(scaling, bounds, self.grid.arrays.lines if lines is None else lines)
             except BaseException:
                 vars(self).update(attributes)
                 self._bind()
@@ -388,11 +417,11 @@ class FittedRMaxAgent:
                 self.rng.bit_generator.state = generator
                 raise
 
-    def _rescale(self, scaling: StateScaling, bounds: StateScaling) -> None:
+    def _rescale(self, scaling: StateScaling, bounds: StateScaling, lines: np.ndarray) -> None:
         before, transitions, lowest = self.task.scaling, self.model.transitions(), self.planner.bounds[0]
         # What a transfer method has learned is about the bounds.
         learned = self._method.get_state() if bounds == self.task.shared_scaling else {}
-        self.task = replace(self.task, scaling=scaling, bounds=bounds)
+        self.task, self.grid = replace(self.task, scaling=scaling, bounds=bounds), self.grid.with_lines(lines)
         self._bind()
         self._build(width=self.mdp.arrays.to.shape[2])
         if learned:
@@ -402,7 +431,9 @@ class FittedRMaxAgent:
         def moved(state: np.ndarray) -> np.ndarray:
             return scaling.to_unit(before.to_raw(state))
 
-        self._take_in_all([(moved(s), a, r, moved(n), t) for s, a, r, n, t in transitions], observed=bool(learned))
+        if scaling != before:
+            transitions = [(moved(s), a, r, moved(n), t) for s, a, r, n, t in transitions]
+        self._take_in_all(transitions, observed=bool(learned))
         self._plan(SWEEPS_AT_EPISODE_END)
 
     def plan_anew(self) -> None:
@@ -427,6 +458,8 @@ class FittedRMaxAgent:
                 "has_acted": np.array([float(self.has_acted)]),
                 "rewards": self.rewards.get_state(),
                 "promises": self.promises.rows(),
+                "lines": self.grid.arrays.lines.copy(),
+                "lines_due": np.array([float(self._lines_due)]),
             }
 
     def set_state(
@@ -436,6 +469,7 @@ class FittedRMaxAgent:
         with self.lock:
             self.task = self.task if scaling is None else replace(self.task, scaling=scaling, bounds=bounds)
             self.rewards.set_state(state["rewards"])
+            self.grid, self._lines_due = self.grid.with_lines(state["lines"]), int(state["lines_due"][0])
             self._bind()
             self._build()
             of_transfer = [name for name in state if name.startswith(OF_TRANSFER)]

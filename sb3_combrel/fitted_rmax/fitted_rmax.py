@@ -57,7 +57,7 @@ class FittedRMax(PastData):
 
     Every state variable is divided by its range. A kernel model per action predicts rewards and relative effects from
     the instances near a state; a state-action pair with too little data is optimistic, its value is ``max_value``;
-    dynamic programming on a uniform grid of states, after every step, computes the value function of this model.
+    dynamic programming on a grid of states, after every step, computes the value function of this model.
     Deviations from the original, and why:
 
     - Successors are moved to the edge of the grid, one cell beyond the box for up to two state variables, the box for more.
@@ -70,6 +70,8 @@ class FittedRMax(PastData):
     - With ``degree=1`` whether an episode ends depends on where one arrives (see ``sb3_combrel.models.ends``).
     - With ``degree=1``, until an episode has ended or rewards have differed, each visit to a place makes it, and an action not
       tried there, worth less by a step (:func:`~sb3_combrel.fitted_rmax.optimism.worth_after_visits`).
+    - With four state variables or more, in a task that goes on for ever, the lines of the grid move to where values between
+      them are wrong (:func:`~sb3_combrel.planning.lines.moved_lines`).
     - A time limit is not a terminal state.
     - Where an agent stays although its values promise otherwise it holds an action drawn at random
       (:class:`~sb3_combrel.fitted_rmax.promises.Promises`).

@@ -38,6 +38,11 @@ class RewardRange:
         return self.n_ended > 0 or self.lowest < self.largest
 
     @property
+    def for_ever(self) -> bool:
+        """Whether what there is to collect is collected for ever, as far as one knows: rewards differ, and nothing ends."""
+        return self.n_ended == 0 and self.lowest < self.largest
+
+    @property
     def gamma(self) -> float:
         """The discount factor."""
         if self._gamma is not None:

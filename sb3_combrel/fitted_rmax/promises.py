@@ -7,7 +7,7 @@ from dataclasses import astuple, dataclass
 import numpy as np
 
 from sb3_combrel.common.constants import KEPT, MAX_MODEL_STEPS
-from sb3_combrel.planning.grid import GridArrays
+from sb3_combrel.planning.grid import StateGrid
 
 
 @dataclass
@@ -36,7 +36,7 @@ class Promises:
     :param n_actions: number of actions
     """
 
-    def __init__(self, grid: GridArrays, n_actions: int):
+    def __init__(self, grid: StateGrid, n_actions: int):
         self._grid, self._n_actions = grid, n_actions
         #: By environment.
         self.stays: dict[int, Stay] = {}
@@ -72,14 +72,18 @@ class Promises:
         self.stays.pop(environment, None)
 
     def _has_left(self, state: np.ndarray, before: np.ndarray) -> bool:
-        apart = np.abs(state - before)
-        apart = np.where(self._grid.periodic, np.minimum(apart, 1.0 - apart), apart)
-        return bool((apart * self._grid.cells >= 1.0).any())
+        grid = self._grid.arrays
+        if grid.even:
+            apart = np.abs(state - before)
+            return bool((np.where(grid.periodic, np.minimum(apart, 1.0 - apart), apart) * grid.cells >= 1.0).any())
+        here, there = self._grid.coordinates(np.stack([state, before]))
+        apart = np.abs(here - there)
+        return bool((np.where(grid.periodic, np.minimum(apart, grid.shape - apart), apart) >= 1.0).any())
 
     def rows(self) -> np.ndarray:
         """The stays, float64, shape (n_environments, n_variables + 7), for :meth:`restore`."""
         rows = [[environment, *stay.state, *astuple(stay)[1:]] for environment, stay in self.stays.items()]
-        return np.array(rows, dtype=np.float64).reshape(-1, len(self._grid.cells) + 7)
+        return np.array(rows, dtype=np.float64).reshape(-1, self._grid.n_variables + 7)
 
     def restore(self, rows: np.ndarray) -> None:
         """Take over what :meth:`rows` returned, whatever a file says."""

@@ -96,7 +96,7 @@ class GridModel(Model):
         self._informed, self._first_reward, self._informed_at = not self.searches, np.nan, 0
         # Sums of the sizes of effects and rewards, by action.
         self._sizes = np.zeros((self.n_actions, self.grid.n_variables + 1))
-        self._cell = float((self.grid.arrays.cells**-2.0).sum()) ** 0.5
+        self._cell = self.grid.diagonal
         # A variable that hardly ever changes is measured by this part of a cell.
         self._least_size = np.append(LEAST_SIZE / self.grid.arrays.cells, 1e-9)
         self._points = tuple(PointScratch.empty(self.grid.arrays, len(self.known)))

@@ -8,7 +8,7 @@ from sb3_combrel.common.compiled import entry_point, inlined
 from sb3_combrel.common.constants import MAX_SURPRISE, SHARE_OF_LIST
 from sb3_combrel.common.periodic import difference
 from sb3_combrel.common.regression import PER_BREADTH
-from sb3_combrel.planning.grid import GridArrays, next_row
+from sb3_combrel.planning.grid import GridArrays, grid_coordinate, next_row, unit_of_line
 
 ROUNDING = 1e-12
 
@@ -83,7 +83,7 @@ def surprise_of(pair, distance, pairs, numbers, state, at, grid, size, predicted
     for v in range(d + 1):
         predicted[v] = pairs.fit[pair, 0, v]
     for k in range(d):
-        away = difference(state[k], (at[k] - grid.margin[k]) / grid.cells[k], grid.periodic[k])
+        away = difference(state[k], unit_of_line(at[k], k, grid), grid.periodic[k])
         for v in range(d + 1):
             predicted[v] += pairs.fit[pair, k + 1, v] * away
     worst = 0.0
@@ -137,12 +137,12 @@ def note_instance(instance, first_pair, pairs, widest, why, grid, rules, scratch
         if grid.periodic[k]:
             first[k], last[k] = 0, grid.shape[k]
         else:
-            first[k] = max(0, int(np.ceil((state[k] - radius) * grid.cells[k] + grid.margin[k])))
-            last[k] = min(grid.shape[k], int(np.floor((state[k] + radius) * grid.cells[k] + grid.margin[k])) + 1)
+            first[k] = max(0, int(np.ceil(grid_coordinate(state[k] - radius, k, grid))))
+            last[k] = min(grid.shape[k], int(np.floor(grid_coordinate(state[k] + radius, k, grid))) + 1)
         if first[k] >= last[k]:
             return 0
         for j in range(first[k], last[k]):
-            apart = difference((j - grid.margin[k]) / grid.cells[k], state[k], grid.periodic[k])
+            apart = difference(unit_of_line(j, k, grid), state[k], grid.periodic[k])
             scratch.along[k, j] = apart * apart
         at[k] = first[k]
     due = 0

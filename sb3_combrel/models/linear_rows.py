@@ -13,7 +13,7 @@ from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.models.ends import Ends, end_at, far_from_ends, squared_distance_of_end
 from sb3_combrel.models.grid_model import add_to_row, total_weight
 from sb3_combrel.models.grid_points import PairArrays, note_fit
-from sb3_combrel.planning.grid import GridArrays, corners_of, grid_coordinates, unit_coordinates_of
+from sb3_combrel.planning.grid import GridArrays, cell_width, corners_of, grid_coordinates, unit_coordinates_of, unit_of_line
 from sb3_combrel.planning.mdp import MDPArrays, RowScratch, add_successor, coordinates_of, finish_row, set_modelled
 from sb3_combrel.planning.q_values import Prediction
 
@@ -144,15 +144,16 @@ def take_step(fit, grid, at, scratch):
     inside = 1.0
     moved = False
     for k in range(len(at)):
-        effect = number_at(fit, k, away)
-        cells = away[k] * grid.cells[k]
-        after = cells + effect * grid.cells[k]
+        here = away[k]
+        there = here + number_at(fit, k, away)
         if not grid.periodic[k]:
-            after = min(max(after, -float(at[k])), float(grid.shape[k] - 1 - at[k]))
-        moved = moved or abs(after - cells) > STAYS
-        if abs(after) > 1.0:
-            inside = min(inside, ((1.0 if after > 0.0 else -1.0) - cells) / (after - cells))
-        step[k] = (after - cells) / grid.cells[k]
+            first, last = unit_of_line(0, k, grid) - scratch.at[k], unit_of_line(grid.shape[k] - 1, k, grid) - scratch.at[k]
+            there = min(max(there, first), last)
+        moved = moved or abs(there - here) * grid.cells[k] > STAYS
+        width = cell_width(at[k], there > 0.0, k, grid)
+        if abs(there) > width:
+            inside = min(inside, ((width if there > 0.0 else -width) - here) / (there - here))
+        step[k] = there - here
         scratch.to[k] = scratch.at[k] + away[k] + step[k]
     return inside if moved else 0.0
 
@@ -188,7 +189,7 @@ def follow(action, length, experience, kernel, fit, grid, at, planned, scratch):
         left = False
         for k in range(d):
             away[k] += taken * scratch.step[k]
-            left = left or abs(away[k]) * grid.cells[k] >= 1.0
+            left = left or abs(away[k]) >= cell_width(at[k], away[k] > 0.0, k, grid)
         if inside == 0.0 or taken < 1.0 or left or end > 0.5:
             break
     return total, goes_on, discount

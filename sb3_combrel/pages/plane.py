@@ -14,6 +14,8 @@ from sb3_combrel.common.suggestions import did_you_mean
 from sb3_combrel.planning.grid import StateGrid
 
 VariablePair = tuple[int | str, int | str]
+#: Along each variable of a picture of a grid whose lines are not evenly spread.
+PIXELS = 64
 #: How the velocity of a variable "x" is called, in lower case without blanks and underscores.
 VELOCITIES = ("v{}", "{}v", "d{}", "{}dot", "dot{}", "vel{}", "{}vel", "velocity{}", "{}velocity", "velocityof{}")
 #: Words in names of variables, and those in the names of their velocities.
@@ -70,12 +72,11 @@ def plane_through(
     across, up = variables
     g = grid.arrays
     unit = np.full(grid.n_variables, 0.5) if at is None else np.clip(scaling.to_unit(at), 0.0, 1.0)
-    nearest = np.rint(unit * g.cells + g.margin).astype(np.int64)
+    nearest = np.rint(grid.coordinates(unit[None])[0]).astype(np.int64)
     held = np.where(g.periodic, nearest % g.shape, nearest)
-    inner = [np.arange(margin, n - margin) for margin, n in zip(g.margin.astype(np.int64), g.shape, strict=True)]
-    held_state = scaling.to_raw((held - g.margin) / g.cells)
-    points = np.array(int(held @ g.strides)) + (inner[across] - held[across]) * g.strides[across]
-    rows = np.zeros(1, dtype=np.int64) if up == across else (inner[up] - held[up]) * g.strides[up]
+    held_state = scaling.to_raw(g.lines[np.arange(grid.n_variables), held])
+    points = np.array(int(held @ g.strides)) + (_shown(grid, across) - held[across]) * g.strides[across]
+    rows = np.zeros(1, dtype=np.int64) if up == across else (_shown(grid, up) - held[up]) * g.strides[up]
     left, right = _edges(grid, scaling, across)
     bottom, top = (0.0, 1.0) if up == across else _edges(grid, scaling, up)
     others = [f"{names[k]} = {held_state[k]:.3g}" for k in range(grid.n_variables) if k not in variables]
@@ -85,6 +86,19 @@ def plane_through(
         extent=(left, right, bottom, top),
         held=", ".join(others),
     )
+
+
+def _shown(grid: StateGrid, variable: int) -> np.ndarray:
+    """The numbers of the grid lines that a picture shows, from left to right: of uneven ones the nearest to each pixel."""
+    g = grid.arrays
+    margin, n = int(g.margin[variable]), int(g.shape[variable])
+    if g.even:
+        return np.arange(margin, n - margin)
+    half_cell = 0.5 / g.cells[variable]
+    last = 1.0 - half_cell if g.periodic[variable] else 1.0 + half_cell
+    pixels = np.linspace(-half_cell, last, 2 * PIXELS + 1)[1::2]
+    away = np.abs(pixels[:, None] - g.lines[variable, : n + 1 if g.periodic[variable] else n])
+    return away.argmin(axis=1) % n
 
 
 def _edges(grid: StateGrid, scaling: StateScaling, variable: int) -> tuple[float, float]:

@@ -75,13 +75,15 @@ def greedy_actions(agent: FittedRMaxAgent, points: np.ndarray) -> np.ndarray:
 
 def _write(shown: Snapshot) -> tuple[str, dict[str, Any]]:
     grid = {"resolution": shown.grid.resolution, "margin": shown.grid.margin, "periodic": shown.grid.arrays.periodic}
+    grid["lines"] = None if shown.grid.arrays.even else shown.grid.arrays.lines
     scaling = {"low": shown.scaling.low, "high": shown.scaling.high}
     return "Snapshot", {**vars(shown), "grid": grid, "scaling": scaling}
 
 
 def _read(grid: Any, scaling: Any, state_names: Any, action_names: Any, values: Any, greedy: Any, bound: Any) -> Snapshot:
+    lines = grid.pop("lines", None)
     return Snapshot(
-        grid=StateGrid(len(grid["resolution"]), **grid),
+        grid=StateGrid(len(grid["resolution"]), **grid, lines=None if lines is None else np.array(lines, dtype=np.float64)),
         scaling=StateScaling(**scaling),
         state_names=tuple(state_names),
         action_names=tuple(action_names),

@@ -1,4 +1,6 @@
-"""The finite sample of states on which Fitted R-Max plans: a uniform grid over the unit box."""
+"""The finite sample of states on which Fitted R-Max plans: a grid over the unit box."""
+
+from __future__ import annotations
 
 import os
 from collections.abc import Sequence
@@ -19,7 +21,8 @@ ON_LINE = 1e-9
 class GridArrays(NamedTuple):
     """What compiled code needs to know of a grid.
 
-    A state with unit coordinates u has *grid coordinates* u * cells + margin: whole numbers at the grid points.
+    A state with unit coordinates u has *grid coordinates*, whole numbers at the grid points: u * cells + margin in an even
+    grid, otherwise in proportion between the grid lines around it.
     """
 
     shape: np.ndarray  # int64, (n_variables,): points along each variable
@@ -28,6 +31,57 @@ class GridArrays(NamedTuple):
     margin: np.ndarray  # float64, (n_variables,): cells beyond either end of the unit box
     # The last point along a periodic variable is a cell away from the first; it has no margin.
     periodic: np.ndarray  # bool, (n_variables,)
+    # float64, (n_variables, most points + 1): unit coordinates of the grid lines; of a periodic variable once more the first.
+    lines: np.ndarray
+    even: bool  # the lines of each variable are equally far from each other
+
+
+@inlined
+def unit_of_line(line, k, grid):
+    """The unit coordinate of a grid line of variable ``k``."""
+    return (line - grid.margin[k]) / grid.cells[k] if grid.even else grid.lines[k, line]
+
+
+@inlined
+def cell_width(line, above, k, grid):
+    """The width, unit coordinates, of the cell of variable ``k`` above or below a grid line; infinite where there is none."""
+    if grid.even:
+        return 1.0 / grid.cells[k]
+    n = grid.shape[k]
+    if not grid.periodic[k] and line == (n - 1 if above else 0):
+        return np.inf
+    lower = line if above else (line - 1) % n
+    return grid.lines[k, lower + 1] - grid.lines[k, lower]
+
+
+@compiled
+def between_lines(unit, k, grid):
+    """The grid coordinate of a unit coordinate of variable ``k``, by the grid lines around it, or the nearest two."""
+    low, high, turns = np.int64(0), grid.shape[k] - 1, 0.0
+    if grid.periodic[k]:
+        high += 1
+        turns = np.floor(unit)
+        unit -= turns
+    turns *= high
+    while high - low > 1:
+        middle = (low + high) // 2
+        if unit < grid.lines[k, middle]:
+            high = middle
+        else:
+            low = middle
+    return turns + low + (unit - grid.lines[k, low]) / (grid.lines[k, high] - grid.lines[k, low])
+
+
+@inlined
+def grid_coordinate(unit, k, grid):
+    """The grid coordinate of a unit coordinate of variable ``k``."""
+    return unit * grid.cells[k] + grid.margin[k] if grid.even else between_lines(unit, k, grid)
+
+
+@inlined
+def cells_away(line, away, k, grid):
+    """How many cells of variable ``k`` a state is from a grid line, being ``away`` from it in unit coordinates."""
+    return away * grid.cells[k] if grid.even else between_lines(grid.lines[k, line] + away, k, grid) - line
 
 
 @inlined
@@ -36,7 +90,7 @@ def unit_coordinates_of(point, grid, at):
     for k in range(len(at)):
         along = point // grid.strides[k]
         point -= along * grid.strides[k]
-        at[k] = (along - grid.margin[k]) / grid.cells[k]
+        at[k] = unit_of_line(along, k, grid)
 
 
 @inlined
@@ -152,7 +206,7 @@ def simplex_of(position, grid, corner_index, corner_weight):
 def grid_coordinates(state, grid, position):
     """Write the grid coordinates of a state to ``position``."""
     for k in range(len(state)):
-        position[k] = state[k] * grid.cells[k] + grid.margin[k]
+        position[k] = grid_coordinate(state[k], k, grid)
 
 
 @inlined
@@ -165,7 +219,7 @@ def interpolate(values, position, grid, corner_index, corner_weight):
 
 
 class StateGrid:
-    """A uniform grid of 2**resolution cells along each variable of the unit box, and a margin around it (C order).
+    """A grid of 2**resolution cells along each variable of the unit box, and a margin around it (C order).
 
     In the margin a predicted successor outside the box has a value of its own; beyond that it counts as the nearest point.
     Along a periodic variable there are 2**resolution points and no margin.
@@ -174,6 +228,8 @@ class StateGrid:
     :param resolution: one number for all variables, or one for each
     :param margin: cells beyond either end of the box, along the variables that are not periodic
     :param periodic: one bool for each state variable; None: none is periodic
+    :param lines: unit coordinates of the grid lines, ascending, shape (n_variables, most points + 1), only without a margin;
+        None: those of an even grid
     """
 
     def __init__(
@@ -182,6 +238,7 @@ class StateGrid:
         resolution: int | Sequence[int],
         margin: int = 0,
         periodic: Sequence[bool] | np.ndarray | None = None,
+        lines: np.ndarray | None = None,
     ):
         per_variable = np.broadcast_to(np.asarray(resolution, dtype=np.int64), (n_variables,))
         flags = flag_array(periodic, n_variables)
@@ -192,7 +249,12 @@ class StateGrid:
         self.resolution = tuple(int(r) for r in per_variable)
         self.margin = margin
         self.n_points = int(np.prod(shape))
-        self.arrays = GridArrays(shape, strides, 2.0**per_variable, margins.astype(np.float64), flags)
+        cells, outside = 2.0**per_variable, margins.astype(np.float64)
+        #: Where the lines of an even grid are, unit coordinates, shape (n_variables, most points + 1).
+        self.even_lines = (np.arange(int(shape.max()) + 1) - outside[:, None]) / cells[:, None]
+        lines = self.even_lines if lines is None else lines
+        even = np.array_equal(lines, self.even_lines)
+        self.arrays = GridArrays(shape, strides, cells, outside, flags, lines, even)
         # The same as a plain tuple (see ``common.compiled``).
         self.plain = tuple(self.arrays)
         self._corner_index = np.empty(2**n_variables, dtype=np.int64)
@@ -204,18 +266,34 @@ class StateGrid:
 
     def states_of(self, points: np.ndarray) -> np.ndarray:
         """Unit coordinates, shape (n, n_variables), of grid points given by their numbers."""
-        coordinates = np.stack(np.unravel_index(points, tuple(self.arrays.shape)), axis=-1)
-        return (coordinates - self.arrays.margin) / self.arrays.cells
+        along = np.unravel_index(points, tuple(self.arrays.shape))
+        return np.stack([self.arrays.lines[k, at] for k, at in enumerate(along)], axis=-1)
+
+    def with_lines(self, lines: np.ndarray) -> StateGrid:
+        """The same grid with other grid lines; an even one if a damaged file says some that do not ascend."""
+        ascending = bool((np.diff(lines) > 0.0).all())
+        return StateGrid(self.n_variables, self.resolution, self.margin, self.arrays.periodic, lines if ascending else None)
+
+    @property
+    def diagonal(self) -> float:
+        """Of the largest cell there could be, unit coordinates."""
+        return float((np.diff(self.arrays.lines, axis=1).max(axis=1) ** 2).sum()) ** 0.5
+
+    def coordinates(self, states: np.ndarray) -> np.ndarray:
+        """Grid coordinates of states, unit coordinates, shape (n, n_variables)."""
+        if self.arrays.even:
+            return states * self.arrays.cells + self.arrays.margin
+        return np.array([[between_lines(unit, k, self.arrays) for k, unit in enumerate(state)] for state in states])
 
     def interpolate(self, values: np.ndarray, state: np.ndarray) -> float:
         """Multilinear interpolation of values at the grid points at a state; outside the grid its nearest point counts."""
-        position = state * self.arrays.cells + self.arrays.margin
+        position = self.coordinates(state[None])[0]
         return interpolate(values, position, self.arrays, self._corner_index, self._corner_weight)
 
     def cells_around(self, states: np.ndarray) -> np.ndarray:
         """The numbers of the corners of the cells that states are in, or of the nearest ones, shape (n, 2 ** n_variables)."""
-        shape, strides, _, _, periodic = self.arrays
-        below = np.floor(states * self.arrays.cells + self.arrays.margin)
+        shape, strides, periodic = self.arrays.shape, self.arrays.strides, self.arrays.periodic
+        below = np.floor(self.coordinates(states))
         low = np.where(periodic, below % shape, np.clip(below, 0, shape - 2)).astype(np.int64)
         high = np.where(periodic, (low + 1) % shape, low + 1)
         corners = np.zeros((len(states), 1), dtype=np.int64)

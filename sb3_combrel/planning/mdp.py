@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_combrel.common.compiled import compiled, entry_point, inlined
-from sb3_combrel.planning.grid import StateGrid, corners_of, n_corners
+from sb3_combrel.planning.grid import StateGrid, cells_away, corners_of, n_corners
 
 NEVER_LEAVES = 1e-9
 
@@ -120,7 +120,7 @@ def add_successor(p, effect, scratch, grid, n_touched):
     :param n_touched: how many of ``scratch.touched`` are filled; how many are now is returned
     """
     for k in range(len(grid.shape)):
-        away = effect[k] * grid.cells[k]
+        away = cells_away(scratch.at[k], effect[k], k, grid)
         scratch.position[k] = scratch.at[k] + away
         scratch.span[k] = max(scratch.span[k], int(np.ceil(min(abs(away), float(grid.shape[k])))))
     for c in range(corners_of(scratch.position, grid, scratch.corner_index, scratch.corner_weight)):

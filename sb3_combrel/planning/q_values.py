@@ -6,7 +6,7 @@ import numpy as np
 
 from sb3_combrel.common.compiled import entry_point, inlined
 from sb3_combrel.common.periodic import difference
-from sb3_combrel.planning.grid import GridArrays, corners_of, grid_coordinates, interpolate
+from sb3_combrel.planning.grid import GridArrays, between_lines, corners_of, grid_coordinate, grid_coordinates, interpolate
 from sb3_combrel.planning.mdp import NEVER_LEAVES, infinite_reward
 
 
@@ -48,8 +48,8 @@ def moves(state, effect, grid, position):
     """Write where ``effect`` leads from ``state`` to ``position`` (grid coordinates); whether that is elsewhere."""
     moved = 0.0
     for k in range(len(state)):
-        here = state[k] * grid.cells[k] + grid.margin[k]
-        there = here + effect[k] * grid.cells[k]
+        here = grid_coordinate(state[k], k, grid)
+        there = here + effect[k] * grid.cells[k] if grid.even else between_lines(state[k] + effect[k], k, grid)
         if grid.periodic[k]:
             moved = max(moved, abs(difference(effect[k], 0.0, True)) * grid.cells[k])
         else:

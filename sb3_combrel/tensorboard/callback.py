@@ -22,6 +22,7 @@ from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.fitted_rmax.vec_envs import refuse_normalized_observations
 from sb3_combrel.pages.plane import VariablePair, check_matplotlib, has_matplotlib, planes_of
+from sb3_combrel.planning.grid import StateGrid
 from sb3_combrel.runs.episodes import EVALUATION_SEED
 from sb3_combrel.tensorboard import readings
 from sb3_combrel.tensorboard.history import ChoiceHistory
@@ -125,6 +126,7 @@ class DashboardCallback(BaseCallback):
         transfer = self.agent.transfer
         self._transfer = transfer if isinstance(transfer, MappingTransfer) else None
         self._scaling: StateScaling | None = None
+        self._grid: StateGrid | None = None
         self._follow_scales()
         self._shown_at = self._drawn_at = self._scalars_at = self.model.num_timesteps
         n_steps = self.model._total_timesteps - self.model.num_timesteps
@@ -211,10 +213,10 @@ class DashboardCallback(BaseCallback):
             self._played.close()
 
     def _follow_scales(self) -> None:
-        """Begin anew with planes and history if the agent has other scales: candidates are then numbered anew."""
-        if self.agent.task.scaling is self._scaling:
+        """Begin anew with planes and history if the agent has other scales or grid lines: candidates are numbered anew."""
+        if self.agent.task.scaling is self._scaling and self.agent.grid is self._grid:
             return
-        self._scaling = self.agent.task.scaling
+        self._scaling, self._grid = self.agent.task.scaling, self.agent.grid
         task = self.agent.task
         self._planes = planes_of(self.agent.grid, task.scaling, task.state_names, self.variables, self.at)
         self._history = ChoiceHistory() if self._transfer is not None and self._transfer.makes_choices else None

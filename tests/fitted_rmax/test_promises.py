@@ -18,7 +18,7 @@ CELL = 1.0 / 8.0
 
 def stay(values, reward, gamma=1.0, n=4 * MAX_MODEL_STEPS, states=None, periodic=None, seed=0):
     """The actions of an agent whose value is ``values`` or a function of the step, and where it stays."""
-    promises, rng = Promises(StateGrid(2, 3, periodic=periodic).arrays, N_ACTIONS), np.random.default_rng(seed)
+    promises, rng = Promises(StateGrid(2, 3, periodic=periodic), N_ACTIONS), np.random.default_rng(seed)
     actions = []
     for k in range(n):
         state = HERE if states is None else states(k)
@@ -81,12 +81,12 @@ def test_to_and_fro_is_a_stay_and_a_longer_way_is_none():
 
 
 def test_each_environment_has_its_own_stay_and_an_episode_ends_it():
-    promises, rng = Promises(StateGrid(2, 3).arrays, N_ACTIONS), np.random.default_rng(0)
+    promises, rng = Promises(StateGrid(2, 3), N_ACTIONS), np.random.default_rng(0)
     for _ in range(MAX_MODEL_STEPS):
         promises.choose(0, HERE, -30.0, BEST, rng)
         promises.pay(0, -1.0, 1.0)
         promises.pay(1, -1.0, 1.0)
-    again = Promises(StateGrid(2, 3).arrays, N_ACTIONS)
+    again = Promises(StateGrid(2, 3), N_ACTIONS)
     again.restore(promises.rows())
     np.testing.assert_array_equal(again.rows(), promises.rows())
     assert promises.choose(1, HERE, -30.0, BEST, rng) == BEST

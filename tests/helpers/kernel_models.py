@@ -10,18 +10,39 @@ from sb3_combrel.planning.mdp import FiniteMDP
 
 N_ACTIONS = 2
 
-# (resolution by variable, margin), and which variables are periodic where some are: a few hundred points at most, as the
-# naive loops are slow.
+# (resolution by variable, margin), which variables are periodic where some are, and grid lines where they are not even: a few
+# hundred points at most, as the naive loops are slow.
 PERIODIC_GRIDS = [
     *[((3,), 1, (True,)), ((2, 2), 1, (True, False)), ((2, 3), 0, (False, True)), ((1, 2, 1), 1, (True, False, True))],
 ]
-GRIDS = [((3,), 1), ((4,), 0), ((2, 2), 1), ((3, 2), 0), ((2, 1), 1), ((1, 2, 1), 0), ((1, 1, 1), 1), *PERIODIC_GRIDS]
+UNEVEN_GRIDS = [
+    ((2,), 0, None, [[0.0, 0.05, 0.5, 0.8, 1.0]]),
+    ((2, 1), 0, (False, True), [[0.0, 0.3, 0.5, 0.52, 1.0], [0.0, 0.8, 1.0]]),
+    ((1, 2, 1), 0, (False, True, False), [[0.0, 0.5, 1.0], [0.0, 0.1, 0.5, 0.55, 1.0], [0.0, 0.3, 1.0]]),
+]
+GRIDS = [
+    ((3,), 1),
+    ((4,), 0),
+    ((2, 2), 1),
+    ((3, 2), 0),
+    ((2, 1), 1),
+    ((1, 2, 1), 0),
+    ((1, 1, 1), 1),
+    *PERIODIC_GRIDS,
+    *UNEVEN_GRIDS,
+]
 
 
 def make_grid(grid):
     """The package's grid of an entry of GRIDS."""
-    resolution, margin, periodic = *grid, *(None,) * (3 - len(grid))
-    return StateGrid(len(resolution), resolution, margin, periodic)
+    resolution, margin, periodic, uneven = *grid, *(None,) * (4 - len(grid))
+    even = StateGrid(len(resolution), resolution, margin, periodic)
+    if uneven is None:
+        return even
+    lines = even.even_lines
+    for k, of_variable in enumerate(uneven):
+        lines[k, : len(of_variable)] = of_variable
+    return even.with_lines(lines)
 
 
 KERNELS = [
@@ -56,7 +77,8 @@ def make_model(grid, kernel, gamma=1.0, max_instances=None, transfer=None, model
 
 def model_and_definition(grid, kernel, gamma=1.0, max_instances=None):
     model = make_model(grid, kernel, gamma, max_instances)
-    return model, NaiveFittedRMax(*grid[:2], N_ACTIONS, kernel, gamma=gamma, periodic=grid[2] if len(grid) > 2 else None)
+    more = dict(zip(("periodic", "lines"), grid[2:], strict=False))
+    return model, NaiveFittedRMax(*grid[:2], N_ACTIONS, kernel, gamma=gamma, **more)
 
 
 def learn(model, transitions):

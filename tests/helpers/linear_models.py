@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from helpers.kernel_models import N_ACTIONS, assert_same_row, make_grid, pairs_of, row_of, without_staying
+from helpers.kernel_models import N_ACTIONS, UNEVEN_GRIDS, assert_same_row, make_grid, pairs_of, row_of, without_staying
 from helpers.naive_local_linear import NaiveLocalLinear
 from sb3_combrel.common.transferred import PriorPredictions
 from sb3_combrel.models.base import ModelSettings
@@ -17,7 +17,15 @@ LINEAR_KERNELS = [
 ]
 
 # As in ``kernel_models.GRIDS``, of a few points.
-SMALL_GRIDS = [((3,), 1), ((2, 2), 0), ((2, 1), 1), ((1, 1, 1), 0), ((3,), 1, (True,)), ((2, 2), 1, (True, False))]
+SMALL_GRIDS = [
+    ((3,), 1),
+    ((2, 2), 0),
+    ((2, 1), 1),
+    ((1, 1, 1), 0),
+    ((3,), 1, (True,)),
+    ((2, 2), 1, (True, False)),
+    *UNEVEN_GRIDS,
+]
 
 # What a model has of each pair.
 PAIRS = ("reach", "n_new", "length", "fitted_at", "weight", "known", "surprise")

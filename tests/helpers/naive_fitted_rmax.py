@@ -59,16 +59,29 @@ def kept_instances(state, instances, breadth, min_weight, min_fraction, periodic
 class NaiveGrid:
     """Grid points by their whole-numbered coordinates."""
 
-    def __init__(self, resolution, margin, periodic=None):
+    def __init__(self, resolution, margin, periodic=None, lines=None):
+        """:param lines: of each variable, from 0 to 1, in place of even ones"""
         self.cells = [2**r for r in resolution]
         self.periodic = list(periodic or [False] * len(resolution))
         self.margin = [0 if wraps else margin for wraps in self.periodic]
         self.shape = [c if wraps else c + 1 + 2 * margin for c, wraps in zip(self.cells, self.periodic, strict=True)]
+        self.lines = lines or [
+            [(i - m) / cells for i in range(n + wraps)]
+            for n, m, cells, wraps in zip(self.shape, self.margin, self.cells, self.periodic, strict=True)
+        ]
         self.coordinates = list(itertools.product(*[range(n) for n in self.shape]))
         self.number = {coordinates: i for i, coordinates in enumerate(self.coordinates)}
 
     def unit(self, point):
-        return np.array([(c - m) / n for c, m, n in zip(self.coordinates[point], self.margin, self.cells, strict=True)])
+        return np.array([lines[c] for c, lines in zip(self.coordinates[point], self.lines, strict=True)])
+
+    def width(self, point, k, above):
+        """The width of the cell of variable ``k`` above or below a point; infinite where there is none."""
+        lines, at = self.lines[k], self.coordinates[point][k]
+        if not above and at == 0:
+            return lines[-1] - lines[-2] if self.periodic[k] else math.inf
+        low = at if above else at - 1
+        return lines[low + 1] - lines[low] if low + 1 < len(lines) else math.inf
 
     def corners(self, unit):
         """{point: weight} of multilinear interpolation, or for more than four variables of that within a simplex.
@@ -76,15 +89,10 @@ class NaiveGrid:
         What lies outside the grid is clipped to its edge, or goes around.
         """
         by_variable = []
-        for u, cells, n, margin, wraps in zip(unit, self.cells, self.shape, self.margin, self.periodic, strict=True):
-            if wraps:
-                low = math.floor(u * cells)
-                part = u * cells - low
-                by_variable.append([(low % n, 1.0 - part), ((low + 1) % n, part)])
-                continue
-            at = min(max(u * cells + margin, 0.0), n - 1.0)
-            low = min(math.floor(at), n - 2)
-            by_variable.append([(low, 1.0 - (at - low)), (low + 1, at - low)])
+        for u, lines, n, wraps in zip(unit, self.lines, self.shape, self.periodic, strict=True):
+            at = np.interp(u % 1.0 if wraps else u, lines, np.arange(len(lines)))
+            low = min(math.floor(at), len(lines) - 2)
+            by_variable.append([(low, 1.0 - (at - low)), ((low + 1) % n, at - low)])
         corners = {}
         if len(by_variable) > 4:
             return self.simplex(by_variable)
@@ -116,9 +124,11 @@ class NaiveGrid:
 class NaiveFittedRMax:
     """The model, its values and Q, all from scratch."""
 
-    def __init__(self, resolution, margin, n_actions, kernel, *, threshold=1.0, gamma=1.0, max_value=0.0, periodic=None):
+    def __init__(
+        self, resolution, margin, n_actions, kernel, *, threshold=1.0, gamma=1.0, max_value=0.0, periodic=None, lines=None
+    ):
         """:param kernel: dict of ``breadth``, ``min_weight`` and ``min_fraction``"""
-        self.grid = NaiveGrid(resolution, margin, periodic)
+        self.grid = NaiveGrid(resolution, margin, periodic, lines)
         self.n_points = len(self.grid.coordinates)
         self.n_actions = n_actions
         self.kernel = (kernel["breadth"], kernel["min_weight"], kernel["min_fraction"])

@@ -78,13 +78,13 @@ class Fit:
 class NaiveLocalLinear:
     """The model of a task.
 
-    :param grid: (resolution by variable, margin[, periodic])
+    :param grid: (resolution by variable, margin[, periodic[, lines]])
     :param kernel: dict of ``breadth``, ``min_weight``, ``n_neighbors`` and ``outcome_breadth``
     :param prior: function of (state, action) that returns effect and weights, shape (d,) each; None for none
     """
 
     def __init__(self, grid, kernel, n_actions, *, threshold=1.0, prior=None, max_instances=None):
-        self.grid = NaiveGrid(*grid[:2], grid[2] if len(grid) > 2 else None)
+        self.grid = NaiveGrid(*grid)
         self.points = [self.grid.unit(point) for point in range(len(self.grid.coordinates))]
         self.n_points, self.n_actions, self.d = len(self.points), n_actions, len(grid[0])
         self.breadth, self.n_neighbors = kernel["breadth"], kernel["n_neighbors"]
@@ -190,20 +190,25 @@ class NaiveLocalLinear:
             after = self.within_grid(point, away + effect)
             stays = (np.abs(after - away) * cells <= 1e-6).all()
             # The part of the step that leaves the cell.
-            beyond = np.abs(after) * cells > 1.0
-            part = min([1.0, *((np.sign(after) / cells - away)[beyond] / (after - away)[beyond])])
+            edge = self.edges(point, after)
+            beyond = np.abs(after) > np.abs(edge)
+            part = min([1.0, *((edge - away)[beyond] / (after - away)[beyond])])
             reward, end = self.outcome(at, after, reward, now)
             taken = 1.0 if n == 0 or end > 0.0 or stays else part
             total += discount * goes_on * taken * reward
             goes_on *= 1.0 - end
             discount *= gamma**taken
             away = away + taken * (after - away)
-            if stays or taken < 1.0 or (np.abs(away) * cells >= 1.0).any() or end > 0.5:
+            if stays or taken < 1.0 or (np.abs(away) >= np.abs(self.edges(point, away))).any() or end > 0.5:
                 break
         return total, {to: goes_on * p for to, p in self.grid.corners(at + away).items()} if goes_on > 0.0 else {}, discount
 
     def within_grid(self, point, away):
         """A displacement from a grid point that does not leave the grid."""
-        coordinates, last = np.array(self.grid.coordinates[point], dtype=float), np.array(self.grid.shape) - 1.0
-        cells, periodic = np.array(self.grid.cells, dtype=float), np.array(self.grid.periodic)
-        return np.where(periodic, away, np.clip(away, -coordinates / cells, (last - coordinates) / cells))
+        first, last = np.array([(lines[0], lines[-1]) for lines in self.grid.lines]).T
+        at = self.points[point]
+        return np.where(np.array(self.grid.periodic), away, np.clip(away, first - at, last - at))
+
+    def edges(self, point, away):
+        """How far the next grid lines are from a grid point, on the side of a displacement."""
+        return np.array([math.copysign(self.grid.width(point, k, a > 0.0), a) for k, a in enumerate(away)])
