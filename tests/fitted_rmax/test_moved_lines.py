@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.wrappers import DiscretizeAction
+from helpers.agents import interrupted_after
 from scipy.interpolate import RegularGridInterpolator
 
 from sb3_combrel import COMBREL, FittedRMax
@@ -53,6 +54,22 @@ def learned(n=N, env=None, **arguments):
 @pytest.fixture(scope="module")
 def model():
     return learned()
+
+
+def saved_and_loaded(model):
+    file = io.BytesIO()
+    model.save(file)
+    file.seek(0)
+    return FittedRMax.load(file, env=Oscillators())
+
+
+def assert_both_learn_on_alike(one, other, n):
+    for each in (one, other):
+        each.set_env(Oscillators())
+        each.env.seed(5)
+        each.learn(n, reset_num_timesteps=False, log_interval=None)
+    np.testing.assert_array_equal(one.agent.grid.arrays.lines, other.agent.grid.arrays.lines)
+    np.testing.assert_array_equal(one.agent.planner.values, other.agent.planner.values)
 
 
 def actions_of(model, n=60):
@@ -110,24 +127,12 @@ def test_past_data_move_them_too():
 
 
 def test_what_is_saved_predicts_the_same_and_learns_on_as_the_model_would(model):
-    file = io.BytesIO()
-    model.save(file)
-    file.seek(0)
-    again = FittedRMax.load(file)
+    again = saved_and_loaded(model)
     np.testing.assert_array_equal(again.agent.grid.arrays.lines, model.agent.grid.arrays.lines)
     np.testing.assert_array_equal(again.agent.planner.values, model.agent.planner.values)
     np.testing.assert_array_equal(actions_of(again), actions_of(model))
-    one, other = learned(), None
-    file = io.BytesIO()
-    one.save(file)
-    file.seek(0)
-    other = FittedRMax.load(file, env=Oscillators())
-    for each in (one, other):
-        each.set_env(Oscillators())
-        each.env.seed(5)
-        each.learn(60, reset_num_timesteps=False, log_interval=None)
-    np.testing.assert_array_equal(one.agent.grid.arrays.lines, other.agent.grid.arrays.lines)
-    np.testing.assert_array_equal(one.agent.planner.values, other.agent.planner.values)
+    one = learned()
+    assert_both_learn_on_alike(one, saved_and_loaded(one), 60)
 
 
 @pytest.mark.parametrize("after", [0, 3, 60])
@@ -136,17 +141,8 @@ def test_an_interrupt_while_lines_move_leaves_the_model_as_it_was(monkeypatch, a
     agent = model.agent
     agent._lines_due = 89
     state = {name: array.copy() for name, array in agent.get_state().items()}
-    counts, add = iter(range(1000)), type(agent.model).add
-
-    def interrupted(self, *transition):
-        if next(counts) == after:
-            raise KeyboardInterrupt
-        return add(self, *transition)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(type(agent.model), "add", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            agent._move_lines()
+    with interrupted_after(monkeypatch, agent, after):
+        agent._move_lines()
     assert agent.grid.arrays.even
     for name, array in agent.get_state().items():
         np.testing.assert_array_equal(array, state[name], err_msg=name)
@@ -188,14 +184,6 @@ def test_with_a_source_lines_move_as_well_and_what_is_saved_learns_on_as_the_mod
     source = FittedRMax(Oscillators(), seed=3).learn(150, log_interval=None).source_instances()
     model = learned(120, transfer=COMBREL(source, use=use))
     assert not model.agent.grid.arrays.even
-    file = io.BytesIO()
-    model.save(file)
-    file.seek(0)
-    again = FittedRMax.load(file, env=Oscillators())
+    again = saved_and_loaded(model)
     np.testing.assert_array_equal(again.agent.planner.values, model.agent.planner.values)
-    for each in (model, again):
-        each.set_env(Oscillators())
-        each.env.seed(5)
-        each.learn(30, reset_num_timesteps=False, log_interval=None)
-    np.testing.assert_array_equal(again.agent.grid.arrays.lines, model.agent.grid.arrays.lines)
-    np.testing.assert_array_equal(again.agent.planner.values, model.agent.planner.values)
+    assert_both_learn_on_alike(model, again, 30)

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from gymnasium import spaces
+from helpers.agents import interrupted_after
 from helpers.walk import walk_source
 from stable_baselines3.common.callbacks import CallbackList, EvalCallback
 from stable_baselines3.common.vec_env import SubprocVecEnv
@@ -227,18 +228,9 @@ def test_an_interrupt_while_scales_are_computed_anew_leaves_the_model_as_it_was(
     model = FittedRMax(Line(low=-np.inf, high=np.inf), transfer=transfer, seed=0).learn(40)
     agent, before = model.agent, model.source_instances()
     state = {name: array.copy() for name, array in agent.get_state().items()}
-    counts, add = iter(range(1000)), type(agent.model).add
-
-    def interrupted(self, *transition):
-        if next(counts) == after:
-            raise KeyboardInterrupt
-        return add(self, *transition)
-
     model.policy.scales.observed[1] += 1.0
-    with monkeypatch.context() as patched:
-        patched.setattr(type(agent.model), "add", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            model.policy.follow_scales(episode_ended=True)
+    with interrupted_after(monkeypatch, agent, after):
+        model.policy.follow_scales(episode_ended=True)
     assert model.policy.to_unit.scaling == agent.task.scaling == model.policy.scales.scaling
     for name, array in agent.get_state().items():
         np.testing.assert_array_equal(array, state[name], err_msg=name)

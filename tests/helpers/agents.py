@@ -1,6 +1,9 @@
 """Agents on arrays, whose raw units are unit coordinates."""
 
+from contextlib import contextmanager
+
 import numpy as np
+import pytest
 
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task
@@ -20,3 +23,19 @@ def assert_same_state(one, other):
     assert one.keys() == other.keys()
     for name, array in one.items():
         np.testing.assert_array_equal(array, other[name], err_msg=name)
+
+
+@contextmanager
+def interrupted_after(monkeypatch, agent, n):
+    """Interrupt what is done within once the model has taken in ``n`` transitions; that it was interrupted is asserted."""
+    counts, add = iter(range(1000)), type(agent.model).add
+
+    def interrupted(self, *transition):
+        if next(counts) == n:
+            raise KeyboardInterrupt
+        return add(self, *transition)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(type(agent.model), "add", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            yield
