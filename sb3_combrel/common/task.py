@@ -17,6 +17,7 @@ class Task:
     :param state_names: names of the state variables, for display; by default s0, s1, ...
     :param action_names: names of the actions, for display; by default a0, a1, ...
     :param bounds: raw <-> the unit coordinates in which variables correspond to those of other tasks; None: ``scaling``
+    :param is_bounded: whether each state variable has bounds of its own, not those between which it has been observed
     :raises ValueError: if there are names, but not one for each variable or action, all different
     """
 
@@ -25,6 +26,7 @@ class Task:
     state_names: Sequence[str] = ()
     action_names: Sequence[str] = ()
     bounds: StateScaling | None = None
+    is_bounded: bool = True
 
     def __post_init__(self) -> None:
         for argument, n, letter in (("state_names", self.n_variables, "s"), ("action_names", self.n_actions, "a")):

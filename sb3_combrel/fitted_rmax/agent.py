@@ -319,12 +319,8 @@ class FittedRMaxAgent:
         return bool((self.mdp.arrays.modelled & ~self.model.known).any())
 
     def _exploit(self, state: np.ndarray) -> int:
-        """The best of what is known: nobody has seen what the others do.
-
-        By the learner's own values; of an agent that has only been given others' transitions by values without optimism, as it
-        has not tried what it hopes for.
-        """
-        prediction, _, _ = self._evaluate(state, None if self.has_acted else self._values_without_optimism())
+        """The best of what is known: nobody has seen what the others do."""
+        prediction, _, _ = self._evaluate(state, self._values_of_frozen())
         eligible = prediction.weight >= self.model.exploration_threshold
         if not eligible.any():
             eligible = prediction.modelled
@@ -332,10 +328,17 @@ class FittedRMaxAgent:
             return int(self._q.q.argmax())
         return int(np.where(eligible, self._q.q, -np.inf).argmax())
 
-    def _values_without_optimism(self) -> np.ndarray | None:
-        """Values at the grid points of what is known alone; None if nothing is."""
+    def _values_of_frozen(self) -> np.ndarray | None:
+        """Values at the grid points by which a frozen policy acts, those of what is known alone; None: the learner's own.
+
+        These it has where a source says what the unknown is worth; and where variables have no bounds: the grid ends where the
+        agent has been, and caution towards its unknown points would drive a frozen policy beyond, where there are none. An
+        agent that has only been given others' transitions is cautious in any case: it has not tried what it hopes for.
+        """
+        if self.has_acted and (self.transfer is not None or not self.task.is_bounded):
+            return None
         if self._cautious is None and self.mdp.arrays.modelled.any():
-            self._cautious = self.planner.cautious_values(SWEEPS_AT_EPISODE_END)
+            self._cautious = self.planner.cautious_values(LONGEST_PLAN)
         return self._cautious
 
     def sample_action(self, state: np.ndarray) -> int:

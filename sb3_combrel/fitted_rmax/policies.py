@@ -60,7 +60,7 @@ class FittedRMaxPolicy(BasePolicy):
         given = FittedRMaxSettings(**settings)
         self.scales = FoundScales(observation_space, given.bounds, given.periodic)
         states, actions = (() if names is None else names for names in (state_names, action_names))
-        task = Task(self.scales.scaling, int(action_space.n), states, actions, self.scales.bounds)
+        task = Task(self.scales.scaling, int(action_space.n), states, actions, self.scales.bounds, self.scales.are_given)
         self.agent = FittedRMaxAgent(given, task, restore_transfer(transfer), rng, model_class)
         self._renew_to_unit()
         self._first_action = int(action_space.start)

@@ -48,6 +48,11 @@ class FoundScales:
         self._whole = False
 
     @property
+    def are_given(self) -> bool:
+        """Whether each state variable has bounds, the user's or the space's."""
+        return not self._by_use.any()
+
+    @property
     def bounds(self) -> StateScaling:
         """The user's or the space's bounds, and for a variable without any those in use."""
         in_use = self.scaling
