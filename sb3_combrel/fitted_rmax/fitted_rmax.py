@@ -77,7 +77,8 @@ class FittedRMax(PastData):
       (:class:`~sb3_combrel.fitted_rmax.promises.Promises`).
 
     ``predict(obs, deterministic=True)`` takes the best known action, or, where there is none, the best that has a model from
-    transferred instances; ``deterministic=False`` takes optimistic ones first, as in learning.
+    transferred instances. It plans without optimism, unless there is a source or a state variable has no bounds.
+    ``deterministic=False`` takes optimistic actions first, as in learning.
 
     ::
 
