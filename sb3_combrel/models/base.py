@@ -30,6 +30,18 @@ class ModelSettings:
     outcome_breadth: float = 0.05
 
 
+class FitOfEffects(NamedTuple):
+    """Local regressions of n pairs on the target's own instances alone. Unit coordinates, float64; NaN without any instance.
+
+    The variance of a next transition's effect around the fitted one is at most ``variance * (1 + leverage)``.
+    """
+
+    slopes: np.ndarray  # (n, n_variables, n_variables): derivative by the first variable of the effect on the second
+    # (n, n_variables): of one instance's effect around the fit; infinite where instances are too few to tell.
+    variance: np.ndarray
+    leverage: np.ndarray  # (n,): by how much it is multiplied for the fitted effect itself
+
+
 class Predictions(NamedTuple):
     """What the target's own instances predict of n state-action pairs. Unit coordinates, float64."""
 
@@ -37,6 +49,8 @@ class Predictions(NamedTuple):
     reward: np.ndarray  # (n,): expected reward
     probability: np.ndarray  # (n, n_successors); what is missing to 1 ends the episode
     effect: np.ndarray  # (n, n_successors, n_variables): displacement to each successor
+    # How sure a model is that fits effects as functions of the state; None for others.
+    fit: FitOfEffects | None = None
 
 
 class InstanceTransfer(Protocol):

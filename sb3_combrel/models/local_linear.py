@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from sb3_combrel.common.constants import RIDGE
 from sb3_combrel.common.regression import LocalFit
-from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, ModelSettings
+from sb3_combrel.models.base import NO_PAIRS, FitOfEffects, InstanceTransfer, ModelSettings, Predictions
 from sb3_combrel.models.grid_model import GridModel
 from sb3_combrel.models.linear_rows import (
     LinearArrays,
@@ -19,6 +20,9 @@ from sb3_combrel.models.linear_rows import (
     weigh,
 )
 from sb3_combrel.planning.mdp import FiniteMDP
+
+# Degrees of freedom, in weights of the nearest instance, below which residuals are but rounding.
+FEWEST_DEGREES = 1e-3
 
 
 class LocalLinear(GridModel):
@@ -101,6 +105,31 @@ class LocalLinear(GridModel):
         found = np.zeros(self.grid.n_variables)
         given = self._plain_experience[0], self._plain_kernel, state, action
         return found, float(predict_alone.call(*given, self._fit, self._scratch, found))
+
+    def predict(self, states: np.ndarray, actions: np.ndarray) -> Predictions:
+        """Predict as :meth:`~sb3_combrel.models.base.Model.predict`, and how sure that is: :attr:`Predictions.fit`."""
+        each = [self._fit_of(state, action) for state, action in zip(states, actions.tolist(), strict=True)]
+        return super().predict(states, actions)._replace(fit=FitOfEffects(*map(np.array, zip(*each, strict=True))))
+
+    def _fit_of(self, state: np.ndarray, action: int) -> tuple[np.ndarray, np.ndarray, float]:
+        """Slopes, residual variance and leverage of one fit.
+
+        The variance is over as many degrees of freedom as weighted instances leave (Schaal & Atkeson, NIPS 1993).
+        """
+        d, fit = self.grid.n_variables, LocalFit(*self._fit)
+        fit.weighted[0] = 0.0
+        _, leverage = self.predict_alone(np.ascontiguousarray(state, dtype=np.float64), action)
+        weight = fit.weighted[0].ravel()
+        used = weight > 0.0
+        if not used.any():
+            return np.full((d, d), np.nan), np.full(d, np.nan), np.nan
+        weight, z, effect = weight[used], fit.z.reshape(d + 1, -1).T[used], fit.number.reshape(d + 1, -1).T[used, :d]
+        inverse = np.linalg.inv((z.T * weight) @ z + RIDGE * np.diag([0.0] + [1.0] * d))
+        residual = effect - z @ (inverse @ (z.T * weight) @ effect)
+        freedom = weight.sum() - (weight**2 * ((z @ inverse) * z).sum(axis=1)).sum()
+        enough = freedom > FEWEST_DEGREES
+        variance = (weight[:, None] * residual**2).sum(axis=0) / freedom if enough else np.full(d, np.inf)
+        return fit.solution[1 : d + 1, :d].copy(), variance, leverage
 
     def _predict_own(self, state: np.ndarray) -> float:
         model, prior = (self._plain_experience, self._plain_linear), self._prior_at(state)

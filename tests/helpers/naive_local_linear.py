@@ -62,6 +62,7 @@ class Fit:
         leverage = np.linalg.inv((design.T * weights) @ design + penalty)[0, 0]
         # In instances at the state; that of the nearest alone bounds it, by the broad kernel.
         sure = min(leverage * math.exp(squared[0] / breadth**2), math.exp(squared[0] / broad**2))
+        self.design, self.penalty, self.weights, self.effects, self.sure = design, penalty, weights, numbers[:, :-1], sure
         for v in np.flatnonzero(prior[1]):
             # An instance of such a weight moves the mean to that of the prior and of own instances worth 1 / sure.
             pull = prior[1][v] / (prior[1][v] + 1.0 / sure)

@@ -46,6 +46,52 @@ def test_the_prediction_at_any_state_is_that_of_the_definition(problem, weight, 
 
 
 @slow_and_repeatable
+@given(problems, weights, st.lists(st.floats(-0.2, 1.2), min_size=3, max_size=3))
+def test_how_sure_an_effect_is_is_that_of_the_definition_without_a_prior(problem, weight, at):
+    (model, naive), (_, alone) = with_some_prior(problem, weight), with_some_prior(problem, None)
+    d = len(problem[0][0])
+    transitions = random_transitions(problem[2], d, problem[3])
+    linear_models.learn_linear(model, naive, transitions)
+    for transition in transitions:
+        alone.add(*transition)
+    for state in np.array([at[:d], transitions[0][0], transitions[-1][0] + 1e-3]):
+        found = model.predict(np.array([state] * N_ACTIONS), np.arange(N_ACTIONS)).fit
+        for action in range(N_ACTIONS):
+            slopes, variance, leverage = (array[action] for array in found)
+            fit, _ = alone.fitted(state, action, alone.now)
+            if fit is None:
+                assert np.isnan([*slopes.ravel(), *variance, leverage]).all()
+                continue
+            np.testing.assert_allclose(slopes, fit.slopes[:, :d], rtol=1e-6, atol=1e-8)
+            assert leverage == pytest.approx(fit.sure, rel=1e-6)
+            hat = (
+                fit.design
+                @ np.linalg.inv((fit.design.T * fit.weights) @ fit.design + fit.penalty)
+                @ (fit.design.T * fit.weights)
+            )
+            freedom = fit.weights @ (1.0 - np.diag(hat))
+            residual = (np.eye(len(hat)) - hat) @ fit.effects
+            expected = fit.weights @ residual**2 / freedom if freedom > 1e-3 else np.full(d, np.inf)
+            np.testing.assert_allclose(variance, expected, rtol=1e-5, atol=1e-10)
+
+
+def test_the_true_effect_is_where_it_is_said_to_be():
+    rng, noise = np.random.default_rng(0), 0.01
+    model = linear_models.make_linear_model(((2, 2), 0), dict(linear_models.LINEAR_KERNELS[0], n_neighbors=30))
+    slopes = np.array([[0.1, -0.2], [0.05, 0.1]])
+    for state in rng.random((2000, 2)):
+        model.add(state, 0, 0.0, state + state @ slopes + noise * rng.standard_normal(2), False)
+    states = rng.uniform(0.1, 0.9, (300, 2))
+    found = model.predict(states, np.zeros(len(states), dtype=np.int64))
+    assert np.sqrt(found.fit.variance.mean()) == pytest.approx(noise, rel=0.03)
+    error = (found.effect[:, 0] - states @ slopes) / np.sqrt(found.fit.variance * found.fit.leverage[:, None])
+    # Instances that weigh less are counted as less exact, which they are not here.
+    assert 0.7 < np.sqrt((error**2).mean()) < 1.0
+    steepness = found.fit.slopes.mean(axis=0)
+    np.testing.assert_allclose(steepness, slopes, atol=0.02)
+
+
+@slow_and_repeatable
 @given(problems, weights, st.sampled_from([1.0, 0.9]), st.booleans(), st.sampled_from([None, None, 4, 9]))
 def test_each_row_is_that_of_the_transitions_up_to_which_it_was_fitted(problem, weight, gamma, small, max_instances):
     model, naive = with_some_prior(problem, weight, gamma=gamma, max_instances=max_instances)
