@@ -179,10 +179,10 @@ def test_pictures_and_pages_show_uneven_lines(model, tmp_path):
     assert any(tmp_path.glob("*.png")) and any(tmp_path.glob("*.html"))
 
 
-@pytest.mark.parametrize("use", ["prior", "instances"])
-def test_with_a_source_lines_move_as_well_and_what_is_saved_learns_on_as_the_model_would(use):
+@pytest.mark.parametrize("how", [dict(mappings="factored"), dict(use="instances")], ids=["prior", "instances"])
+def test_with_a_source_lines_move_as_well_and_what_is_saved_learns_on_as_the_model_would(how):
     source = FittedRMax(Oscillators(), seed=3).learn(150, log_interval=None).source_instances()
-    model = learned(120, transfer=COMBREL(source, use=use))
+    model = learned(120, transfer=COMBREL(source, **how))
     assert not model.agent.grid.arrays.even
     again = saved_and_loaded(model)
     np.testing.assert_array_equal(again.agent.planner.values, model.agent.planner.values)
