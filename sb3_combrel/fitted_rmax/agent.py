@@ -29,6 +29,7 @@ from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.fitted_rmax.correspondence import Correspondence, NoTransfer, OfLearner
+from sb3_combrel.fitted_rmax.frozen import cautious_function
 from sb3_combrel.fitted_rmax.optimism import RewardRange, worth_after_visits
 from sb3_combrel.fitted_rmax.promises import Promises
 from sb3_combrel.fitted_rmax.settings import MODELS, FittedRMaxSettings
@@ -94,7 +95,7 @@ class FittedRMaxAgent:
         self.n_sweeps = 0
         #: Whether it has learned from what it has done itself.
         self.has_acted = False
-        self._cautious: np.ndarray | None = None
+        self._cautious: ValueFunction | None = None
         #: How often an action without a model was chosen in learning.
         self.n_optimistic_actions = 0
         #: Whether to measure the time of planning, which takes some itself.
@@ -194,13 +195,18 @@ class FittedRMaxAgent:
         return chosen
 
     def _evaluate(
-        self, state: np.ndarray, values: np.ndarray | None = None
+        self, state: np.ndarray, function: ValueFunction | None = None
     ) -> tuple[Prediction, TransferredInstances | None, int]:
-        """Compute the action values at a state; what is predicted and transferred there, and the best action, -1 for ties."""
+        """Compute the action values at a state; what is predicted and transferred there, and the best action, -1 for ties.
+
+        :param function: the values of states; None: the learner's own
+        """
         prediction, given = self.model.predict_at(state)
-        values = self.planner.values if values is None else values
-        function = ValueFunction(values, self.grid.plain, self.mdp.gamma, self.planner.bounds, self.planner.worth)
-        return prediction, given, self._q.compute(prediction, state, function)
+        return prediction, given, self._q.compute(prediction, state, function or self._function(self.planner.values))
+
+    def _function(self, values: np.ndarray) -> ValueFunction:
+        """The values of states between the grid points; shape (n_points,) at these."""
+        return ValueFunction(values, self.grid.plain, self.mdp.gamma, self.planner.bounds, self.planner.worth)
 
     def update(
         self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool, environment: int = 0
@@ -320,7 +326,7 @@ class FittedRMaxAgent:
 
     def _exploit(self, state: np.ndarray) -> int:
         """The best of what is known: nobody has seen what the others do."""
-        prediction, _, _ = self._evaluate(state, self._values_of_frozen())
+        prediction, _, _ = self._evaluate(state, self._function_of_frozen())
         eligible = prediction.weight >= self.model.exploration_threshold
         if not eligible.any():
             eligible = prediction.modelled
@@ -328,17 +334,20 @@ class FittedRMaxAgent:
             return int(self._q.q.argmax())
         return int(np.where(eligible, self._q.q, -np.inf).argmax())
 
-    def _values_of_frozen(self) -> np.ndarray | None:
-        """Values at the grid points by which a frozen policy acts, those of what is known alone; None: the learner's own.
+    def _function_of_frozen(self) -> ValueFunction | None:
+        """The values by which a frozen policy acts, those of what is known alone; None: the learner's own.
 
         These it has where a source says what the unknown is worth; and where variables have no bounds: the grid ends where the
         agent has been, and caution towards its unknown points would drive a frozen policy beyond, where there are none. An
         agent that has only been given others' transitions is cautious in any case: it has not tried what it hopes for.
+
+        Where lines move, the grid is what limits the policy, and these are values on a finer one. Where there is an end to be
+        reached, they are not: a finer plan finds ways to it that nobody has tried, where the model is wrong.
         """
         if self.has_acted and (self.transfer is not None or not self.task.is_bounded):
             return None
         if self._cautious is None and self.mdp.arrays.modelled.any():
-            self._cautious = self.planner.cautious_values(LONGEST_PLAN)
+            self._cautious = cautious_function(self.model, self.planner, self._lines_move and self.transfer is None)
         return self._cautious
 
     def sample_action(self, state: np.ndarray) -> int:
@@ -357,7 +366,8 @@ class FittedRMaxAgent:
         :return: shape (n_actions,)
         """
         with self.lock:
-            self._evaluate(np.ascontiguousarray(state, dtype=np.float64), values)
+            function = None if values is None else self._function(values)
+            self._evaluate(np.ascontiguousarray(state, dtype=np.float64), function)
             return self._q.q.copy()
 
     def take_in(self, transitions: Sequence[Transition]) -> None:
@@ -387,14 +397,19 @@ class FittedRMaxAgent:
                 self._method.end_episode(truncated=False)
         self._outdated = [self.model.outdated()]
 
+    @property
+    def _lines_move(self) -> bool:
+        """Whether the grid limits what can be had: it is coarse, and a place for staying has to be kept to exactly."""
+        return self.is_coarse and self.rewards.for_ever
+
     def _move_lines(self) -> None:
         """Move the lines of a coarse grid to where values between them are wrong, whenever experience has grown by a tenth.
 
         That is by how much a value interpolated at a state differs from the best action's there; the latter half of the
         experience counts. Where there is an end to come to, lines stay: no place is for staying.
         """
-        n = self.model.n_instances if self.is_coarse and self.rewards.for_ever else 0
-        if n < self._lines_due:
+        n = self.model.n_instances
+        if not self._lines_move or n < self._lines_due:
             return
         states, values = [state for state, *_ in self.model.transitions()[n // 2 :]], self.planner.values
         errors = [abs(self.grid.interpolate(values, state) - self.q_values(state).max()) for state in states]

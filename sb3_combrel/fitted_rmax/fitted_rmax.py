@@ -77,8 +77,9 @@ class FittedRMax(PastData):
       (:class:`~sb3_combrel.fitted_rmax.promises.Promises`).
 
     ``predict(obs, deterministic=True)`` takes the best known action, or, where there is none, the best that has a model from
-    transferred instances. It plans without optimism, unless there is a source or a state variable has no bounds.
-    ``deterministic=False`` takes optimistic actions first, as in learning.
+    transferred instances. It plans without optimism, unless there is a source or a state variable has no bounds; where the
+    lines of the grid move, on a grid twice as fine, for seconds once more has been learned, if that has at most a million
+    pairs. ``deterministic=False`` takes optimistic actions first, as in learning.
 
     ::
 

@@ -91,6 +91,8 @@ class Model(ABC):
     searches: ClassVar[bool] = False
     #: Whether the planner leaves points out on which no change bears that is larger than its tolerance.
     follows_changes: ClassVar[bool] = False
+    #: Whether all pairs of a finer grid are fitted within seconds: a frozen policy may then plan on one.
+    plans_finer: ClassVar[bool] = False
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
         self.mdp, self.grid, self.n_actions = mdp, mdp.grid, mdp.n_actions
@@ -175,6 +177,16 @@ class Model(ABC):
         length = np.full(self.n_actions, predictions.probability.shape[1], dtype=np.int64)
         arrays = map(np.ascontiguousarray, (predictions.probability, predictions.effect))
         return Prediction(modelled, weight, predictions.reward, length, *arrays), given
+
+    def on(self, mdp: FiniteMDP) -> Model:
+        """A model of the same instances over another finite MDP, all of whose pairs it fits; without transfer."""
+        model = type(self)(mdp, self.settings)
+        model._share_instances(self)
+        model.update_all(np.arange(len(model.known)))
+        return model
+
+    def _share_instances(self, other: Model) -> None:
+        self.instances = other.instances
 
     def predict_alone(self, state: np.ndarray, action: int) -> tuple[np.ndarray, float]:
         """Predict the effect of an action at a state without a prior.

@@ -224,6 +224,14 @@ class GridModel(Model):
         """The pairs with transferred instances that have new ones of their own."""
         return NO_PAIRS if self._giver is None else np.flatnonzero((self.pairs.n_new > 0) & ~self.known)
 
+    def _share_instances(self, other: Model) -> None:
+        assert isinstance(other, GridModel)
+        super()._share_instances(other)
+        self.n_added = other.n_added
+        self._renew_arrivals()
+        if other._informed:
+            self._set_informed()
+
     def outdated(self) -> np.ndarray:
         return np.flatnonzero(self.pairs.n_new)
 

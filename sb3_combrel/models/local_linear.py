@@ -45,7 +45,7 @@ class LocalLinear(GridModel):
     Parameters: see :class:`~sb3_combrel.models.base.Model`.
     """
 
-    takes_prior = searches = True
+    takes_prior = searches = plans_finer = True
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
         self._n_fitted = mdp.grid.n_variables + 1

@@ -72,7 +72,7 @@ def test_its_values_are_those_of_plain_value_iteration_over_what_is_known():
 def test_a_source_or_variables_without_bounds_leave_it_the_learner_s_own_values():
     assert frozen(line_agent(is_bounded=False)) == [LEFT]
     # Its instances tell nothing here, as what is known needs none; but it might say what the unknown is worth.
-    assert line_agent(Mine())._values_of_frozen() is None
+    assert line_agent(Mine())._function_of_frozen() is None
     cautious = line_agent(is_bounded=False, acted=False)
     assert frozen(cautious) == [RIGHT], "what others have seen is all there is to go by"
 

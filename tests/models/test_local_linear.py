@@ -7,6 +7,9 @@ from helpers.kernel_models import N_ACTIONS, pairs_of, random_transitions
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sb3_combrel.models.local_linear import LocalLinear
+from sb3_combrel.planning.mdp import FiniteMDP
+
 slow_and_repeatable = settings(deadline=None, derandomize=True, max_examples=15)
 problems = st.tuples(
     st.sampled_from(linear_models.SMALL_GRIDS),
@@ -43,6 +46,24 @@ def test_the_prediction_at_any_state_is_that_of_the_definition(problem, weight, 
         np.testing.assert_array_equal(
             several.probability[:, 0], np.where(prediction.length, prediction.probability[:, 0], 0.0)
         )
+
+
+@slow_and_repeatable
+@given(problems)
+def test_on_a_finer_grid_it_is_the_model_that_its_transitions_make_there_and_it_stays_as_it_is(problem):
+    grid, kernel, seed, n, threshold = problem
+    model, same = (linear_models.make_linear_model(grid, kernel, threshold=threshold, gamma=0.9) for _ in range(2))
+    finer = FiniteMDP(model.grid.finer(), N_ACTIONS, 0.9)
+    expected = LocalLinear(FiniteMDP(model.grid.finer(), N_ACTIONS, 0.9), model.settings)
+    for transition in random_transitions(seed, len(grid[0]), n):
+        for each in (model, same):
+            each.update_rows(each.add(*transition))
+        expected.add(*transition)
+    expected.update_all(np.arange(len(expected.known)))
+    found = model.on(finer)
+    assert found.mdp is finer and found.transfer is None
+    linear_models.assert_same_to_the_last_bit(found, expected)
+    linear_models.assert_same_to_the_last_bit(model, same)
 
 
 @slow_and_repeatable

@@ -48,6 +48,19 @@ def test_grid_coordinates_are_whole_numbers_at_the_points_and_go_on_beyond(grid)
     assert (beyond[0] < 0.0).all() and (beyond[1] > own.arrays.shape - 1.0).all()
 
 
+@pytest.mark.parametrize("grid", [((2, 3), 0), ((2, 2), 0, (True, False)), ((1, 2), 1), *UNEVEN_GRIDS], ids=str)
+def test_a_finer_grid_has_the_lines_of_a_grid_and_others_in_the_middle_between_them(grid):
+    own = make_grid(grid)
+    finer = own.finer()
+    assert finer.resolution == tuple(r + 1 for r in own.resolution) and finer.margin == own.margin
+    assert finer.arrays.even == own.arrays.even
+    np.testing.assert_array_equal(finer.arrays.periodic, own.arrays.periodic)
+    for k, n in enumerate(2 ** np.array(own.resolution)):
+        lines, before = (g.arrays.lines[k, g.margin * (not g.arrays.periodic[k]) :] for g in (finer, own))
+        np.testing.assert_allclose(lines[: 2 * n + 1 : 2], before[: n + 1], atol=1e-15)
+        np.testing.assert_allclose(lines[1 : 2 * n : 2], (before[:n] + before[1 : n + 1]) / 2.0, atol=1e-15)
+
+
 def test_even_lines_make_an_even_grid_and_lines_that_a_damaged_file_says_do_not_count():
     uneven = make_grid(UNEVEN_GRIDS[1])
     assert not uneven.arrays.even and uneven.with_lines(uneven.even_lines).arrays.even
