@@ -63,7 +63,8 @@ def test_runs_of_the_benchmark(pair, method, seed=25000):
     assert " ".join(map(str, run.carry_out().steps)) == str(expected["steps_of_episodes"])
 
 
-def test_runs_of_other_tasks(name="reacher-easy", seed=23000, budgets=(500, 1000)):
+@pytest.mark.parametrize("name", ["reacher-easy", "cartpole-balance"])
+def test_runs_of_other_tasks(name, seed=23000, budgets=(500, 1000)):
     task = other_tasks.TASKS[name]
     env = partial(task.made_for, other_tasks.FITTED_RMAX)
     run = other_tasks.BudgetJob(
