@@ -347,7 +347,8 @@ class FittedRMaxAgent:
         if self.has_acted and (self.transfer is not None or not self.task.is_bounded):
             return None
         if self._cautious is None and self.mdp.arrays.modelled.any():
-            self._cautious = cautious_function(self.model, self.planner, self._lines_move and self.transfer is None)
+            finer = self._lines_move and self.transfer is None and self.task.is_bounded
+            self._cautious = cautious_function(self.model, self.planner, finer)
         return self._cautious
 
     def sample_action(self, state: np.ndarray) -> int:
