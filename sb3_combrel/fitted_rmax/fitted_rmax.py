@@ -88,7 +88,8 @@ class FittedRMax(PastData):
         action, _ = model.predict(np.array([-0.5, 0.0]), deterministic=True)
 
     A step's time is mostly that of two sweeps over the grid and of fitting pairs anew. Memory, with four state variables about
-    160 bytes for an instance and 500 for a state-action pair of the grid, is bounded by ``max_instances`` and by the grid.
+    160 bytes for an instance and 500 for a state-action pair of the grid, is bounded by ``max_instances`` and by the grid, and
+    by a finer one while a frozen policy plans on that.
 
     :param policy: "FittedRMaxPolicy" (or "MlpPolicy", which means the same); may be left out: ``FittedRMax(env)``
     :param env: the environment to learn from (if registered in Gymnasium, can be a str)

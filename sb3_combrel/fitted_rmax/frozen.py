@@ -16,10 +16,9 @@ def cautious_function(model: Model, planner: Planner, finer: bool) -> ValueFunct
     :param finer: whether to fit and plan on a grid twice as fine as the learner's, which takes seconds, if the model does so
         and there is room. The learner has no time for that at every step.
     """
-    mdp = model.mdp
-    n_actions, gamma, (low, high) = mdp.n_actions, mdp.gamma, planner.bounds
-    if finer and model.plans_finer and model.grid.finer().n_points * n_actions <= MAX_PAIRS_BY_DEFAULT:
-        mdp = FiniteMDP(model.grid.finer(), n_actions, gamma)
+    mdp, grid = model.mdp, model.grid.finer()
+    if finer and model.plans_finer and grid.n_points * mdp.n_actions <= MAX_PAIRS_BY_DEFAULT:
+        mdp, (low, high) = FiniteMDP(grid, mdp.n_actions, mdp.gamma), planner.bounds
         model.on(mdp)
         planner = Planner(mdp, max_value=high, min_value=low, tolerance=planner.tolerance)
-    return ValueFunction(planner.cautious_values(LONGEST_PLAN), mdp.grid.plain, gamma, planner.bounds, planner.worth)
+    return ValueFunction(planner.cautious_values(LONGEST_PLAN), mdp.grid.plain, mdp.gamma, planner.bounds, planner.worth)
