@@ -65,7 +65,7 @@ inlined = _njit(**_options, inline="always")
 # ``compiled``, for loops whose sums may be taken in any order, as vector registers do.
 compiled_fast = _njit(**_options, fastmath={"reassoc", "contract", "nsz", "arcp"})
 
-# A variable that starts as a plain 0 and is passed to another compiled function would have that function compiled twice,
+# A variable that starts as a plain 0, say, and is passed to another compiled function would have that function compiled twice,
 # for the constant and for the variable: such variables start as np.int64(0).
 
 

@@ -126,7 +126,7 @@ def scan_block(instances, action, block, state, farthest, length, items, distanc
 @inlined
 def take_nearest_block(gap, n_blocks):
     """The nearest block that has not been taken, -1 for none; its gap becomes NaN, which is near nothing."""
-    nearest, least = -1, np.inf
+    nearest, least = np.int64(-1), np.inf
     for block in range(n_blocks):
         if gap[block] < least:
             nearest, least = block, gap[block]

@@ -6,6 +6,8 @@ import os
 import pickle
 import runpy
 import shutil
+import subprocess
+import sys
 import types
 import warnings
 
@@ -25,6 +27,22 @@ from sb3_combrel.common.periodic import difference, differences, periodic_flags
 from sb3_combrel.common.scaling import StateScaling
 
 MESSAGE = "sb3_combrel: compiling"
+# Learns with and without a source, and prints compiled functions of the package that have a version for a constant.
+VERSIONS_FOR_CONSTANTS = """
+import sys
+from numba.core.dispatcher import Dispatcher
+from sb3_combrel import COMBREL, FittedRMax, SourceInstances
+source = SourceInstances.record(None, "MountainCar-v0", n_instances=200, seed=0)
+for settings in ({}, {"degree": 0}):
+    FittedRMax("MountainCar-v0", seed=0, transfer=COMBREL(source), **settings).learn(200)
+modules = [module for name, module in sys.modules.items() if name.startswith("sb3_combrel.")]
+found = [getattr(value, "function", value) for module in modules for value in vars(module).values()]
+compiled = {value for value in found if isinstance(value, Dispatcher) and value.nopython_signatures}
+assert len(compiled) > 30, len(compiled)
+for each in compiled:
+    if any("Literal" in str(argument) for signature in each.nopython_signatures for argument in signature.args):
+        print(each.py_func.__name__)
+"""
 
 
 def test_an_entry_point_returns_what_the_function_returns_and_can_be_copied():
@@ -229,3 +247,11 @@ def test_wrong_flags_are_named_with_their_value(flags):
 def test_flags_come_as_a_sequence_an_array_or_none():
     assert periodic_flags(None, 2) == (False, False)
     assert periodic_flags((True, False), 2) == periodic_flags(np.array([True, False]), 2) == (True, False)
+
+
+@pytest.mark.long
+def test_no_function_is_compiled_once_more_for_a_constant(tmp_path):
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-c", VERSIONS_FOR_CONSTANTS]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, ""), done.stdout + done.stderr
