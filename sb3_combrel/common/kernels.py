@@ -129,7 +129,7 @@ def take_nearest_block(gap, n_blocks):
     nearest, least = np.int64(-1), np.inf
     for block in range(n_blocks):
         if gap[block] < least:
-            nearest, least = block, gap[block]
+            nearest, least = np.int64(block), gap[block]
     if nearest >= 0:
         gap[nearest] = np.nan
     return nearest
