@@ -16,8 +16,8 @@ def cautious_function(model: Model, planner: Planner, finer: bool) -> ValueFunct
     :param finer: whether to fit and plan on a grid twice as fine as the learner's, which takes seconds, if the model does so
         and there is room. The learner has no time for that at every step.
     """
-    mdp, grid = model.mdp, model.grid.finer()
-    if finer and model.plans_finer and grid.n_points * mdp.n_actions <= MAX_PAIRS_BY_DEFAULT:
+    mdp = model.mdp
+    if finer and model.plans_finer and (grid := model.grid.finer()).n_points * mdp.n_actions <= MAX_PAIRS_BY_DEFAULT:
         mdp, (low, high) = FiniteMDP(grid, mdp.n_actions, mdp.gamma), planner.bounds
         model.on(mdp)
         planner = Planner(mdp, max_value=high, min_value=low, tolerance=planner.tolerance)
