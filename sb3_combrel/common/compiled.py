@@ -103,7 +103,7 @@ class _Announcement(event.Listener):
         module = getattr(event.data["dispatcher"].py_func, "__module__", None) or ""
         if not self.printed and module.startswith("sb3_combrel."):
             self.printed = True
-            message = "sb3_combrel: compiling inner loops for this machine, once (up to half a minute) ..."
+            message = "sb3_combrel: compiling inner loops for this machine, once (up to a minute) ..."
             print(message, file=sys.stderr, flush=True)
 
     def on_end(self, event: Any) -> None:
