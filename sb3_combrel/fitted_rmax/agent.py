@@ -342,13 +342,14 @@ class FittedRMaxAgent:
         agent that has only been given others' transitions is cautious in any case: it has not tried what it hopes for.
 
         Where lines move, the grid is what limits the policy, and these are values on a finer one. Where there is an end to be
-        reached, they are not: a finer plan finds ways to it that nobody has tried, where the model is wrong.
+        reached, they are not: a finer plan finds ways to it that nobody has tried, where the model is wrong. Where a grid is
+        not coarse, an action is held until it leaves a cell; the cells of a coarse one are too large for that.
         """
         if self.has_acted and (self.transfer is not None or not self.task.is_bounded):
             return None
         if self._cautious is None and self.mdp.arrays.modelled.any():
             finer = self._lines_move and self.transfer is None and self.task.is_bounded
-            self._cautious = cautious_function(self.model, self.planner, finer)
+            self._cautious = cautious_function(self.model, self.planner, finer, holds=not self.is_coarse)
         return self._cautious
 
     def sample_action(self, state: np.ndarray) -> int:

@@ -41,11 +41,12 @@ class ValueFunction(NamedTuple):
     gamma: float
     bounds: tuple[float, float]  # min_value, max_value
     worth: np.ndarray  # float64, (n_points,): value of an optimistic action at the grid points
+    holds: bool = False  # whether an action that moves by a part of a cell is held until the cell is left
 
 
 @inlined
 def moves(state, effect, grid, position):
-    """Write where ``effect`` leads from ``state`` to ``position`` (grid coordinates); whether that is elsewhere."""
+    """Write where ``effect`` leads from ``state`` to ``position`` (grid coordinates); by how many cells, at most 1."""
     moved = 0.0
     for k in range(len(state)):
         here = grid_coordinate(state[k], k, grid)
@@ -56,7 +57,7 @@ def moves(state, effect, grid, position):
             there = min(max(there, 0.0), float(grid.shape[k] - 1))
             moved = max(moved, abs(there - here))
         position[k] = there
-    return moved >= 1e-9
+    return min(moved, 1.0) if moved >= 1e-9 else 0.0
 
 
 @inlined
@@ -75,19 +76,28 @@ def evaluate_actions(prediction, state, function, q, scratch):
     """Q of every action at ``state``, into ``q``, shape (n_actions,); the best action, -1 if several are; plain tuples.
 
     An effect of exactly nothing leads back to the state itself, whose value is the maximum sought, not the interpolated one:
-    as in ``finish_row``, staying is summed as a geometric series.
+    as in ``finish_row``, staying is summed as a geometric series. Where actions are held, of a move by a part of a cell the
+    rest counts as staying: values between grid points may promise more than any action keeps, as across a wall, and a step
+    that hardly moves would never pay for it. Munos & Moore (2002) follow a control until it leaves the cell.
     """
     prediction, function = Prediction(*prediction), ValueFunction(*function)
     grid = GridArrays(*function.grid)
     position, corner_index, corner_weight = scratch
-    best, ties = 0, 0
+    best, ties, here = 0, 0, 0.0
+    if function.holds:
+        grid_coordinates(state, grid, position)
+        here = interpolate(function.values, position, grid, corner_index, corner_weight)
     for action in range(len(q)):
         if prediction.modelled[action]:
             after, stay = 0.0, 0.0
             for k in range(prediction.length[action]):
                 p = prediction.probability[action, k]
-                if moves(state, prediction.effect[action, k], grid, position):
-                    after += p * interpolate(function.values, position, grid, corner_index, corner_weight)
+                part = moves(state, prediction.effect[action, k], grid, position)
+                if part > 0.0:
+                    rest = 1.0 - part if function.holds else 0.0
+                    there = interpolate(function.values, position, grid, corner_index, corner_weight)
+                    after += p * (there - rest * here)
+                    stay += p * rest
                 else:
                     stay += p
             leave = 1.0 - function.gamma * stay

@@ -77,6 +77,13 @@ def test_a_source_or_variables_without_bounds_leave_it_the_learner_s_own_values(
     assert frozen(cautious) == [RIGHT], "what others have seen is all there is to go by"
 
 
+def test_it_holds_actions_until_they_leave_a_cell_but_on_a_coarse_grid_and_in_learning():
+    fine, coarse = line_agent(), line_agent()
+    coarse.is_coarse = True
+    assert fine._function_of_frozen().holds and not coarse._function_of_frozen().holds
+    assert not fine._function(fine.planner.values).holds
+
+
 def test_it_follows_what_is_learned_and_changes_none_of_it():
     agent, unasked = line_agent(), line_agent()
     before = frozen(agent)

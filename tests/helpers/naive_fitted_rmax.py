@@ -200,9 +200,13 @@ class NaiveFittedRMax:
         least = min_fraction * self.threshold / (1.0 + min_fraction)
         return max(sum(w for _, w in kept), sum(w for _, w in heavy if w >= least)) >= self.threshold
 
-    def q_values(self, state, values, min_value):
-        """Q at an exact state from values at the grid points; staying put is worth the state's own Q."""
-        q = []
+    def q_values(self, state, values, min_value, holds=False):
+        """Q at an exact state from values at the grid points; staying put is worth the state's own Q.
+
+        :param holds: whether an action is held until a cell is left: of a move by a part of a cell the rest is staying, and
+            the value of where it leads counts by how much it differs from the value of staying
+        """
+        q, value_at = [], lambda unit: sum(p * values[to] for to, p in self.grid.corners(unit).items())
         for action in range(self.n_actions):
             kept = self.kept_at(state, action)
             total = sum(w for _, w in kept)
@@ -216,10 +220,15 @@ class NaiveFittedRMax:
                 if instance.terminated:
                     continue
                 here, there = self.grid.clipped(state), self.grid.clipped(state + instance.effect)
-                if np.abs(there - here).max() < 1e-12:
+                moved = zip(apart(there, here, self.grid.periodic), self.grid.cells, strict=True)
+                part = min(1.0, max(abs(by) * cells for by, cells in moved))
+                if part < 1e-12:
                     stay += w / total
+                elif holds:
+                    stay += w / total * (1.0 - part)
+                    after += w / total * (value_at(there) - (1.0 - part) * value_at(here))
                 else:
-                    after += w / total * sum(p * values[to] for to, p in self.grid.corners(there).items())
+                    after += w / total * value_at(there)
             if 1.0 - self.gamma * stay < 1e-9:
                 value = 0.0 if reward == 0.0 else math.copysign(math.inf, reward)
             else:

@@ -25,7 +25,14 @@ def agent_and_definition(n_variables, resolution, *, gamma=1.0, max_value=0.0, t
     return agent, naive
 
 
-@settings(deadline=None, derandomize=True, max_examples=15)
+def q_values(agent, state, values, holds):
+    if not holds:
+        return agent.q_values(state, values)
+    agent._evaluate(state, agent._function(values)._replace(holds=True))
+    return agent._q.q.copy()
+
+
+@settings(deadline=None, derandomize=True, max_examples=25)
 @given(
     st.integers(0, 10**6),
     st.integers(1, 3),
@@ -34,8 +41,9 @@ def agent_and_definition(n_variables, resolution, *, gamma=1.0, max_value=0.0, t
     st.sampled_from([0.3, 1.0, 2.5]),
     st.sampled_from([0.0, 7.0, -3.0]),
     st.sampled_from([None, (True, True, True), (True, False, True)]),
+    st.booleans(),
 )
-def test_q_is_the_backup_of_the_instances_near_the_state(seed, n_variables, n, gamma, threshold, max_value, periodic):
+def test_q_is_the_backup_of_the_instances_near_the_state(seed, n_variables, n, gamma, threshold, max_value, periodic, holds):
     rng = np.random.default_rng(seed)
     flags = None if periodic is None else periodic[:n_variables]
     arguments = dict(gamma=gamma, threshold=threshold, max_value=max_value, periodic=flags)
@@ -54,8 +62,8 @@ def test_q_is_the_backup_of_the_instances_near_the_state(seed, n_variables, n, g
     values = max_value - 5.0 * rng.random(naive.n_points)
     agent.planner.bounds = (max_value - 20.0, max_value)
     for state in [rng.random(n_variables) for _ in range(5)] + [t[0] for t in transitions[:5]]:
-        expected = naive.q_values(state, values, max_value - 20.0)
-        found = agent.q_values(state, values)
+        expected = naive.q_values(state, values, max_value - 20.0, holds)
+        found = q_values(agent, state, values, holds)
         np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
         # Optimism is exact: exploration finds untried actions by comparing with ==.
         np.testing.assert_array_equal(found == max_value, expected == max_value)
@@ -106,6 +114,28 @@ def test_pushing_against_the_edge_of_the_grid_is_staying():
     for _ in range(2):
         agent.model.add(corner, 0, -1.0, corner + 0.3, False)
     assert agent.q_values(corner)[0] == -100.0
+
+
+@pytest.mark.parametrize("effect", [0.25, 0.3, 0.1, 0.0])
+def test_an_action_is_held_until_it_leaves_a_cell(line, effect):
+    """Cells are 0.25 wide, and values fall by 1 from one to the next: to leave takes so many steps, each for -1."""
+    line.learn(0.5, effect)
+    held, once = (q_values(line.agent, np.array([0.5]), line.values, holds)[0] for holds in (True, False))
+    here, n_steps = -3.0, 0.25 / effect if effect else np.inf
+    assert held == pytest.approx(once if effect in (0.25, 0.3, 0.0) else -n_steps + here - 1.0)
+
+
+def test_values_that_no_action_keeps_do_not_hold_a_frozen_policy():
+    """Interpolated across a wall, values here are higher than any action's: to press pays by them, and never gets anywhere."""
+    agent = make_agent(1, 2, degree=0, model_breadth=0.12, resolution=2, gamma=1.0, max_value=0.0)
+    agent.planner.bounds = (-100.0, 0.0)
+    here = np.array([0.5])
+    for _ in range(3):
+        agent.model.add(here, 0, -1.0, here + 0.001, False)
+        agent.model.add(here, 1, -1.0, here - 0.25, False)
+    values = np.array([0.0, -10.0, -12.0, 0.0, 0.0, 0.0, 0.0])  # 0 here, -12 to the left
+    assert q_values(agent, here, values, False).argmax() == 0, "the wall"
+    assert q_values(agent, here, values, True).argmax() == 1, "the way around"
 
 
 def test_asking_for_q_changes_nothing_and_gives_an_array_of_the_caller_s_own(line):
