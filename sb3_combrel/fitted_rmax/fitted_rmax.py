@@ -79,7 +79,8 @@ class FittedRMax(PastData):
     ``predict(obs, deterministic=True)`` takes the best known action, or, where there is none, the best that has a model from
     transferred instances. It plans without optimism, unless there is a source or a state variable has no bounds; where the
     lines of the grid move, on a grid twice as fine, for seconds once more has been learned, if that has at most a million
-    pairs. ``deterministic=False`` takes optimistic actions first, as in learning.
+    pairs; and it holds an action until a cell of the grid is left, unless that has only eight cells a variable or fewer.
+    ``deterministic=False`` takes optimistic actions first, as in learning.
 
     ::
 
