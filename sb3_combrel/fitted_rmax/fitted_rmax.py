@@ -77,10 +77,10 @@ class FittedRMax(PastData):
       (:class:`~sb3_combrel.fitted_rmax.promises.Promises`).
 
     ``predict(obs, deterministic=True)`` takes the best known action, or, where there is none, the best that has a model from
-    transferred instances. It plans without optimism, unless there is a source or a state variable has no bounds; where the
-    lines of the grid move, on a grid twice as fine, for seconds once more has been learned, if that has at most a million
-    pairs; and it holds an action until a cell of the grid is left, unless that has only eight cells a variable or fewer.
-    ``deterministic=False`` takes optimistic actions first, as in learning.
+    transferred instances. It plans without optimism, unless there is a source. Where the lines of the grid move it does so on a
+    grid twice as fine, for seconds once more has been learned, if that has at most a million pairs. It holds an action until a
+    cell of the grid is left. A grid of only eight cells a variable or fewer is too coarse for that, and, where a state variable
+    has no bounds, for doing without optimism. ``deterministic=False`` takes optimistic actions first, as in learning.
 
     ::
 
@@ -118,8 +118,8 @@ class FittedRMax(PastData):
     :param degree: of the local model: 1, effects are fitted as linear functions of the state to the instances near it
         (:class:`~sb3_combrel.models.local_linear.LocalLinear`); or 0, their kernel average, Jong & Stone's, which needs more
         instances (:class:`~sb3_combrel.models.kernel_average.KernelAverage`)
-    :param n_neighbors: with ``degree=1``, instances that a fit is made to. None: 16 for one or two state variables, 24 for
-        three, 30 for four, 40 for five, 60 for more
+    :param n_neighbors: with ``degree=1``, instances that a fit is made to; more (50, 100) where effects or rewards are random,
+        as they average that out. None: 16 for one or two state variables, 24 for three, 30 for four, 40 for five, 60 for more
     :param outcome_breadth: with ``degree=1``, the broadest that the kernel is by which arrivals decide on ends
     :param periodic: one bool for each state variable: whether it is periodic, as an angle is, and its bounds one period apart.
         Distances, effects and the grid go around; an observation outside the bounds is wrapped. None: what the environment

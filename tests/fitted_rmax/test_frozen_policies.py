@@ -15,10 +15,10 @@ LEFT, RIGHT = 0, 1
 HERE = np.array([0.45])
 
 
-def line_agent(transfer=None, is_bounded=True, acted=True, **settings):
+def line_agent(transfer=None, is_bounded=True, acted=True, is_coarse=False, **settings):
     """Steps of 0.05 cost 1, and an end beyond 0.9; nobody has been below 0.35, where all is worth 0 until somebody has."""
     agent = make_agent(1, 2, transfer, max_value=0.0, gamma=1.0, resolution=5, **settings)
-    agent.task = replace(agent.task, is_bounded=is_bounded)
+    agent.task, agent.is_coarse = replace(agent.task, is_bounded=is_bounded), is_coarse
     rng = np.random.default_rng(0)
     states = [np.array([at]) for at in rng.uniform(0.4, 0.95, 200)]
     actions = rng.integers(2, size=200).tolist()
@@ -69,17 +69,17 @@ def test_its_values_are_those_of_plain_value_iteration_over_what_is_known():
         assert expected[agent.act(state, explore=False)] == pytest.approx(expected.max(), abs=1e-2)
 
 
-def test_a_source_or_variables_without_bounds_leave_it_the_learner_s_own_values():
-    assert frozen(line_agent(is_bounded=False)) == [LEFT]
+def test_a_source_or_a_coarse_grid_without_bounds_leave_it_the_learner_s_own_values():
+    assert frozen(line_agent(is_bounded=False, is_coarse=True)) == [LEFT]
+    assert frozen(line_agent(is_bounded=False)) == frozen(line_agent(is_coarse=True)) == [RIGHT]
     # Its instances tell nothing here, as what is known needs none; but it might say what the unknown is worth.
     assert line_agent(Mine())._function_of_frozen() is None
-    cautious = line_agent(is_bounded=False, acted=False)
+    cautious = line_agent(is_bounded=False, is_coarse=True, acted=False)
     assert frozen(cautious) == [RIGHT], "what others have seen is all there is to go by"
 
 
 def test_it_holds_actions_until_they_leave_a_cell_but_on_a_coarse_grid_and_in_learning():
-    fine, coarse = line_agent(), line_agent()
-    coarse.is_coarse = True
+    fine, coarse = line_agent(), line_agent(is_coarse=True)
     assert fine._function_of_frozen().holds and not coarse._function_of_frozen().holds
     assert not fine._function(fine.planner.values).holds
 
