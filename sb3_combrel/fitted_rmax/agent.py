@@ -337,9 +337,10 @@ class FittedRMaxAgent:
     def _function_of_frozen(self) -> ValueFunction | None:
         """The values by which a frozen policy acts, those of what is known alone; None: the learner's own.
 
-        These it has where a source says what the unknown is worth; and on a coarse grid where variables have no bounds: it ends
-        where the agent has been, and caution towards its unknown points would drive a frozen policy beyond, where there are
-        none. An agent that has only been given others' transitions is cautious in any case: it has not tried what it hopes for.
+        These it has where a source says what the unknown is worth; and on a coarse grid where variables have no bounds: that
+        ends where the agent has been, and caution towards its unknown points would drive a frozen policy beyond, where there
+        are none. An agent that has only been given others' transitions is cautious in any case: it has not tried what it hopes
+        for.
 
         Where lines move, the grid is what limits the policy, and these are values on a finer one. Where there is an end to be
         reached, they are not: a finer plan finds ways to it that nobody has tried, where the model is wrong. Where a grid is
