@@ -77,11 +77,11 @@ class FittedRMax(PastData):
       (:class:`~sb3_combrel.fitted_rmax.promises.Promises`).
 
     ``predict(obs, deterministic=True)`` takes the best known action, or, where there is none, the best that has a model from
-    transferred instances. It plans without optimism, unless there is a source: what nobody has seen is worth the least that
-    there is, or, where a state variable has no bounds and the grid is coarse, has eight cells a variable or fewer, as little
-    as the least around it. Where the lines of the grid move it plans on one twice as fine, for seconds once more has been
-    learned, if that has at most a million pairs. Where it is not coarse an action is held until a cell is left.
-    ``deterministic=False`` takes optimistic actions first, as in learning.
+    transferred instances. It plans without optimism, unless there is a source. Where the lines of the grid move it does so on
+    a grid twice as fine, for seconds once more has been learned, if that has at most a million pairs. It holds an action until
+    a cell of the grid is left. A grid of only eight cells a variable or fewer is too coarse for that, and, where a state
+    variable has no bounds, for planning without optimism. ``deterministic=False`` takes optimistic actions first, as in
+    learning.
 
     ::
 
