@@ -337,22 +337,21 @@ class FittedRMaxAgent:
     def _function_of_frozen(self) -> ValueFunction | None:
         """The values by which a frozen policy acts, those of what is known alone; None: the learner's own.
 
-        These it has where a source says what the unknown is worth. An agent that has only been given others' transitions is
-        cautious in any case: it has not tried what it hopes for. On a coarse grid where variables have no bounds the unknown
-        is worth as little as the least around it: the grid ends where the agent has been, and the cliffs of the least that
-        there is would drive a frozen policy beyond, where there are none.
+        These it has where a source says what the unknown is worth; and on a coarse grid where variables have no bounds: that
+        ends where the agent has been, and caution towards its unknown points would drive a frozen policy beyond, where there
+        are none. An agent that has only been given others' transitions is cautious in any case: it has not tried what it hopes
+        for.
 
         Where lines move, the grid is what limits the policy, and these are values on a finer one. Where there is an end to be
         reached, they are not: a finer plan finds ways to it that nobody has tried, where the model is wrong. Where a grid is
         not coarse, an action is held until it leaves a cell; the cells of a coarse one are too large for that.
         """
-        if self.has_acted and self.transfer is not None:
+        ends_coarsely = self.is_coarse and not self.task.is_bounded
+        if self.has_acted and (self.transfer is not None or ends_coarsely):
             return None
         if self._cautious is None and self.mdp.arrays.modelled.any():
-            coarse, bounded = self.is_coarse, self.task.is_bounded
-            finer = self._lines_move and self.transfer is None and bounded
-            ways = {"finer": finer, "holds": not coarse, "around": coarse and not bounded}
-            self._cautious = cautious_function(self.model, self.planner, **ways)
+            finer = self._lines_move and self.transfer is None and self.task.is_bounded
+            self._cautious = cautious_function(self.model, self.planner, finer, holds=not self.is_coarse)
         return self._cautious
 
     def sample_action(self, state: np.ndarray) -> int:

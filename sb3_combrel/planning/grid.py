@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import minimum_filter1d
 
 from sb3_combrel.common.compiled import compiled, inlined
 from sb3_combrel.common.periodic import flag_array
@@ -290,19 +289,6 @@ class StateGrid:
     def diagonal(self) -> float:
         """Of the largest cell there could be, unit coordinates."""
         return float((np.diff(self.arrays.lines, axis=1).max(axis=1) ** 2).sum()) ** 0.5
-
-    def least_around(self, values: np.ndarray, known: np.ndarray) -> np.ndarray:
-        """Give each point that is not known the least value of the known ones beside it, and so on from there.
-
-        :param values: shape (n_points,); ``known``: bool, the same, at least one
-        :return: shape (n_points,); of the known ones as they are
-        """
-        least = np.where(known, values, np.inf).reshape(tuple(self.arrays.shape))
-        modes = ["wrap" if wraps else "constant" for wraps in self.arrays.periodic]
-        while (missing := np.isinf(least)).any():
-            along = [minimum_filter1d(least, 3, axis=k, mode=mode, cval=np.inf) for k, mode in enumerate(modes)]
-            least[missing] = np.min(along, axis=0)[missing]
-        return least.reshape(-1)
 
     def coordinates(self, states: np.ndarray) -> np.ndarray:
         """Grid coordinates of states, unit coordinates, shape (n, n_variables)."""

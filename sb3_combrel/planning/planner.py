@@ -146,20 +146,11 @@ class Planner:
         more = self.tolerance, self._told, changed, span, self.mdp.grid.plain, self._scratch
         return self._repeat(sweep_changes, given, more, max_sweeps)
 
-    def cautious_values(self, max_sweeps: int, around: bool = False) -> np.ndarray:
-        """Values at the grid points without optimism, from below: of ways that exist, however few sweeps there are.
-
-        :param around: whether a point where no action has a model is worth as little as the least around it that has one; else
-            the least there is
-        """
-        lowest = self.bounds[0]
-        values, worth = np.full((2, len(self.values)), lowest)
-        unknown = (self.mdp.arrays.n_optimistic == self.mdp.n_actions) & (around and self.mdp.arrays.modelled.any())
-        for n in range(max_sweeps):
-            if unknown.any():
-                worth[unknown] = self.mdp.grid.least_around(values, ~unknown)[unknown]
-            if sweep.call(values, self._rows, self.upper, worth, lowest, False, n % 2 == 1) <= self.tolerance:
-                break
+    def cautious_values(self, max_sweeps: int) -> np.ndarray:
+        """Values at the grid points without optimism, from below: of ways that exist, however few sweeps there are."""
+        values = np.full(len(self.values), self.bounds[0])
+        # What nobody has seen is worth the least there is.
+        self._repeat(sweep, (values, self._rows, self.upper, values.copy(), self.bounds[0], False), (), max_sweeps)
         return values
 
     @property

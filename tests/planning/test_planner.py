@@ -281,45 +281,6 @@ def test_cautious_values_are_those_of_the_modelled_pairs_alone_and_come_from_bel
     np.testing.assert_array_equal(planner.values, before)
 
 
-@pytest.mark.parametrize(("grid", "n"), [(((4,), 0), 4), (((3, 3), 0), 14), (((3, 3), 0, (False, True)), 14)])
-def test_the_unknown_is_worth_as_little_as_the_least_around_it(grid, n):
-    planner = planned(grid, seed=1, n=n)
-    values, arrays = planner.cautious_values(MANY, around=True), planner.mdp.arrays
-    unknown = ~arrays.modelled.reshape(N_ACTIONS, -1).any(axis=0)
-    least = least_of_neighbours(planner.mdp.grid, values, ~unknown)
-    np.testing.assert_array_equal(planner.mdp.grid.least_around(values, ~unknown), least)
-    assert unknown.any() and (values[unknown] > MIN_VALUE).any()
-    # Each point is worth what the definition gives for the values of the others.
-    for point in np.flatnonzero(~unknown):
-        rows = zip(arrays.reward[point], arrays.weight[point], arrays.to[point], arrays.length[point], strict=True)
-        q = [reward + weight[:length] @ values[to[:length]] for reward, weight, to, length in rows]
-        modelled = arrays.modelled.reshape(N_ACTIONS, -1)[:, point]
-        assert values[point] == pytest.approx(np.clip(np.max(np.array(q)[modelled]), MIN_VALUE, 2.0), abs=1e-8)
-    assert (values >= planner.cautious_values(MANY) - 1e-9).all()
-
-
-def least_of_neighbours(grid, values, known):
-    """Of each point that is not known the least of those that have a value beside it, round by round."""
-    shape, periodic = tuple(grid.arrays.shape), grid.arrays.periodic
-    least = {
-        point: value
-        for point, value in zip(np.ndindex(shape), values, strict=True)
-        if known[np.ravel_multi_index(point, shape)]
-    }
-    while len(least) < len(values):
-        found = {}
-        for point in set(np.ndindex(shape)) - set(least):
-            beside = []
-            for k, n in enumerate(shape):
-                for step in (-1, 1):
-                    at = point[k] + step
-                    beside.append((*point[:k], at % n if periodic[k] else at, *point[k + 1 :]))
-            if values_beside := [least[each] for each in beside if each in least]:
-                found[point] = min(values_beside)
-        least |= found
-    return np.array([least[point] for point in np.ndindex(shape)])
-
-
 def test_restored_values_are_cut_to_their_bounds_and_converge_to_the_same_as_before():
     planner = planned(((3, 2), 1), seed=3, n=100, gamma=0.95)
     planner.sweep(MANY)
