@@ -77,11 +77,10 @@ class FittedRMax(PastData):
       (:class:`~sb3_combrel.fitted_rmax.promises.Promises`).
 
     ``predict(obs, deterministic=True)`` takes the best known action, or, where there is none, the best that has a model from
-    transferred instances. It plans without optimism, unless there is a source. Where the lines of the grid move it does so on
-    a grid twice as fine, for seconds once more has been learned, if that has at most a million pairs. It holds an action until
-    a cell of the grid is left. A grid of only eight cells a variable or fewer is too coarse for that, and, where a state
-    variable has no bounds, for planning without optimism. ``deterministic=False`` takes optimistic actions first, as in
-    learning.
+    transferred instances. Without a source it plans without optimism, where the lines of the grid move on a grid twice as
+    fine, for seconds once more has been learned, if that has at most a million pairs; and it holds an action until a cell of
+    the grid is left. A grid of only eight cells a variable or fewer is too coarse for holding, and, where a state variable
+    has no bounds, for planning without optimism. ``deterministic=False`` takes optimistic actions first, as in learning.
 
     ::
 

@@ -45,7 +45,7 @@ class ValueFunction(NamedTuple):
 
 
 @inlined
-def moves(state, effect, grid, position):
+def move(state, effect, grid, position):
     """Write where ``effect`` leads from ``state`` to ``position`` (grid coordinates); by how many cells, at most 1."""
     moved = 0.0
     for k in range(len(state)):
@@ -92,7 +92,7 @@ def evaluate_actions(prediction, state, function, q, scratch):
             after, stay = 0.0, 0.0
             for k in range(prediction.length[action]):
                 p = prediction.probability[action, k]
-                part = moves(state, prediction.effect[action, k], grid, position)
+                part = move(state, prediction.effect[action, k], grid, position)
                 if part > 0.0:
                     rest = 1.0 - part if function.holds else 0.0
                     there = interpolate(function.values, position, grid, corner_index, corner_weight)

@@ -116,13 +116,14 @@ def test_pushing_against_the_edge_of_the_grid_is_staying():
     assert agent.q_values(corner)[0] == -100.0
 
 
-@pytest.mark.parametrize("effect", [0.25, 0.3, 0.1, 0.0])
-def test_an_action_is_held_until_it_leaves_a_cell(line, effect):
-    """Cells are 0.25 wide, and values fall by 1 from one to the next: to leave takes so many steps, each for -1."""
+@pytest.mark.parametrize(
+    ("effect", "held", "once"), [(0.25, -5.0, -5.0), (0.3, -5.2, -5.2), (0.1, -6.5, -4.4), (0.0, -100.0, -100.0)]
+)
+def test_an_action_is_held_until_it_leaves_a_cell(line, effect, held, once):
+    """Cells are 0.25 wide, and values fall from -3 by 1 to the next: to leave by 0.1 takes 2.5 steps, each for -1."""
     line.learn(0.5, effect)
-    held, once = (q_values(line.agent, np.array([0.5]), line.values, holds)[0] for holds in (True, False))
-    here, n_steps = -3.0, 0.25 / effect if effect else np.inf
-    assert held == pytest.approx(once if effect in (0.25, 0.3, 0.0) else -n_steps + here - 1.0)
+    for holds, expected in ((True, held), (False, once)):
+        assert q_values(line.agent, np.array([0.5]), line.values, holds)[0] == pytest.approx(expected)
 
 
 def test_values_that_no_action_keeps_do_not_hold_a_frozen_policy():
