@@ -4,33 +4,23 @@ from __future__ import annotations
 
 import os
 import reprlib
-import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_combrel.common.scaling import LARGEST_BOUND, StateScaling
-from sb3_combrel.common.task import Task
 from sb3_combrel.common.user_warnings import warn_user
 from sb3_combrel.fitted_rmax.saving import SavedAlgorithm
-from sb3_combrel.sources.recipes import is_table
+from sb3_combrel.sources.experience import KINDS, read_experience, read_named
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.sources.transitions import describe_origin
 
 SelfPastData = TypeVar("SelfPastData", bound="PastData")
 
-KINDS = (
-    "SourceInstances, a file (.npz, .csv or a saved model's .zip), a pandas DataFrame, a Minari dataset or its id, a replay "
-    "buffer, a model, or a controller: a function of the state that returns an action"
-)
-# What pandas reads, besides CSV files.
-TABLES_OF_PANDAS = (".parquet", ".pq", ".feather", ".json", ".jsonl", ".tsv", ".xlsx", ".xls", ".h5", ".hdf5")
 # Warnings: an angle that spans more periods, and a value that lies beyond nearly all others by more ranges of theirs.
 MANY_PERIODS, MANY_RANGES = 10, 20
 
@@ -47,10 +37,11 @@ class PastData(SavedAlgorithm):
         They do not count as time steps. Scales that are found from observations, ``gamma`` and ``max_value`` follow them.
         For experience of a task with other states or actions there is ``transfer=COMBREL(source)``.
 
-        :param instances: :class:`~sb3_combrel.SourceInstances`; the path of a file of them, of a CSV file, or of a saved
-            model; a pandas DataFrame (columns: :meth:`SourceInstances.from_table`); a Minari dataset or its id; a replay
-            buffer of Stable-Baselines3; a model of this class or with a replay buffer, of which its experience; or any other
-            model, or a function from one state, raw units, to an action, which then acts in the model's environment
+        :param instances: what holds experience, as of a source, see :func:`~sb3_combrel.sources.experience.read_experience`:
+            :class:`~sb3_combrel.SourceInstances`, a file of them, a CSV file or that of a saved model, a pandas DataFrame
+            (columns: :meth:`SourceInstances.from_table`), a Minari dataset or its id, a replay buffer, a model of this class
+            or with a replay buffer; or any other model, or a function from one state, raw units, to an action, which then acts
+            in the model's environment
         :param n_instances: steps that such a model or function makes in the environment
         :return: this model
         :raises FileNotFoundError: if there is no such file
@@ -110,23 +101,15 @@ class PastData(SavedAlgorithm):
             "state_names": None if _are_numbered(task.state_names) else tuple(task.state_names),
             "action_names": () if _are_numbered(task.action_names) else tuple(task.action_names),
         }
-        if isinstance(given, SourceInstances):
-            return given
-        if hasattr(given, "columns") and hasattr(given, "iloc"):
-            return SourceInstances.from_table(given, **names)
         if isinstance(given, str | os.PathLike):
-            return self._read_file(Path(given), names)
-        if hasattr(given, "iterate_episodes"):
-            return SourceInstances.from_minari(given)
-        if isinstance(given, PastData):
-            return given.source_instances()
-        buffer = given if isinstance(given, ReplayBuffer) else getattr(given, "replay_buffer", None)
-        if isinstance(buffer, ReplayBuffer) and buffer.size() > 0:
-            return _of_buffer(buffer, task)
-        if isinstance(given, ReplayBuffer):
-            raise ValueError(f"instances must be transitions, got a {type(given).__name__} that is empty")
+            return read_named("instances", given, names)
+        if (found := read_experience(given, names)) is not None:
+            return found
         if isinstance(given, type) or not (hasattr(given, "predict") or callable(given)):
-            raise ValueError(f"instances must be {KINDS}, got {reprlib.repr(given)}")
+            raise ValueError(
+                f"instances must be {KINDS}; or a model or a controller, a function of the state that returns an action, got "
+                f"{reprlib.repr(given)}"
+            )
         return self._act(given, n_instances)
 
     def _act(self, controller: Callable[[np.ndarray], int] | Any, n_instances: int) -> SourceInstances:
@@ -141,32 +124,6 @@ class PastData(SavedAlgorithm):
         # The environment is in the middle of an episode of the controller's: the next ``learn`` begins one of its own.
         self._last_obs = None
         return found
-
-    def _read_file(self, path: Path, names: dict[str, Any]) -> SourceInstances:
-        if path.suffix.lower() in (".pkl", ".pickle") and path.is_file():
-            raise ValueError(
-                f"{path} is a pickle, which may run any program when it is read: if you trust it, read it with "
-                "stable_baselines3.common.save_util.load_from_pkl, or pandas.read_pickle, and pass what it holds"
-            )
-        if is_table(path):
-            return SourceInstances.from_table(path, **names)
-        if _is_saved_model(path):
-            return type(self).load(path).source_instances()
-        if path.is_dir():
-            raise ValueError(f"instances must be a file, got the folder {path}")
-        if path.suffix.lower() in TABLES_OF_PANDAS and path.is_file():
-            raise ValueError(f"instances must be {KINDS}; read {path} with pandas, and pass the DataFrame")
-        if path.is_file() or path.suffix == ".npz" or path.with_name(f"{path.name}.npz").is_file():
-            return SourceInstances.load(path)
-        for suffix in (".zip", ".pkl"):
-            if (saved := path.with_name(f"{path.name}{suffix}")).is_file():
-                return self._read_file(saved, names)
-        try:
-            return SourceInstances.from_minari(str(path))
-        except (FileNotFoundError, ImportError) as error:
-            raise FileNotFoundError(
-                f"there is no file {path}, looked for in {Path.cwd()}, and no Minari dataset of that name is here ({error})"
-            ) from error
 
     def _of_this_task(self, found: SourceInstances) -> SourceInstances:
         """The instances with the variables and actions in the task's own order; a ValueError if they are of another task."""
@@ -237,14 +194,6 @@ def _far_beyond(values: np.ndarray) -> float | None:
     return float(values[beyond.argmax()]) if beyond.max() > MANY_RANGES * (high - low) > 0.0 else None
 
 
-def _is_saved_model(path: Path) -> bool:
-    """Whether a file is that of a saved model, whatever its name ends in."""
-    if not path.is_file() or not zipfile.is_zipfile(path):
-        return path.suffix.lower() == ".zip"
-    with zipfile.ZipFile(path) as archive:
-        return "data" in archive.namelist()
-
-
 def _are_numbered(names: Sequence[str]) -> bool:
     """Whether names are those that are given where a task has none: s0, s1, ... or a0, a1, ..."""
     return all(name[1:] == str(k) for k, name in enumerate(names))
@@ -275,35 +224,3 @@ def _numbers_of_actions(given: tuple[str, ...], own: tuple[str, ...], other: str
     if unknown:
         raise ValueError(f"instances must have the actions {own}, or some of them, got {given}, with {unknown}{other}")
     return np.array([own.index(name) for name in given])
-
-
-def _of_buffer(buffer: ReplayBuffer, task: Task) -> SourceInstances:
-    """The transitions of a replay buffer, environment by environment, in the order in which they came."""
-    if buffer.optimize_memory_usage:
-        raise ValueError("a replay buffer with optimize_memory_usage=True does not keep in which states episodes ended")
-    if not isinstance(buffer.observations, np.ndarray) or not isinstance(buffer.action_space, spaces.Discrete):
-        raise ValueError(
-            f"a replay buffer must have Box observations and Discrete actions, got {buffer.observation_space} and "
-            f"{buffer.action_space}"
-        )
-    oldest = buffer.pos if buffer.full else 0
-    rows = (oldest + np.arange(buffer.size())) % buffer.buffer_size
-
-    def column(array: np.ndarray) -> np.ndarray:
-        return np.concatenate([array[rows, e].reshape(len(rows), -1) for e in range(buffer.n_envs)]).astype(np.float64)
-
-    states, next_states = column(buffer.observations), column(buffer.next_observations)
-    limits = np.full(states.shape[1], -np.inf), np.full(states.shape[1], np.inf)
-    scaling = StateScaling.from_observed(limits, np.concatenate([states, next_states]))
-    if not buffer.handle_timeout_termination and buffer.dones.any():
-        warn_user(
-            "the replay buffer has handle_timeout_termination=False and does not say which episodes a time limit ended: "
-            f"all {int(buffer.dones[rows].sum())} ends count as terminal states"
-        )
-    ended, truncated = column(buffer.dones)[:, 0] > 0.5, column(buffer.timeouts)[:, 0] > 0.5
-    actions = column(buffer.actions)[:, 0].astype(np.int64) - int(buffer.action_space.start)
-    return SourceInstances(
-        *(states, actions, column(buffer.rewards)[:, 0], next_states, ended & ~truncated, scaling.low, scaling.high),
-        int(buffer.action_space.n),
-        origin={"env": None, "recorder": "replay buffer"},
-    )

@@ -1,4 +1,4 @@
-"""Fitted R-Max as a learner of source tasks."""
+"""Fitted R-Max as a learner of source tasks, and its saved models as sources."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import gymnasium as gym
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
+from sb3_combrel.sources.experience import READERS
 from sb3_combrel.sources.source_recorder import SourceRecorder
 from sb3_combrel.sources.transitions import LEARNERS, Transitions, as_transition_count, make_env
 
@@ -29,3 +30,4 @@ def learn_fitted_rmax(env: str | gym.Env[Any, Any], seed: int | None, n_episodes
 
 
 LEARNERS["fitted_rmax"] = learn_fitted_rmax
+READERS["fitted_rmax"] = lambda file: FittedRMax.load(file).source_instances()

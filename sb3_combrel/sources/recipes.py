@@ -1,4 +1,4 @@
-"""Sources by name: a file of instances, or a task that is learnt once and kept in a file."""
+"""Sources by name: what holds experience, or a task that is learnt once and kept in a file."""
 
 from __future__ import annotations
 
@@ -14,15 +14,24 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import gymnasium as gym
+import pandas as pd
 from gymnasium.envs.registration import EnvSpec, load_env_creator
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_combrel.common.scaling import has_bounds
 from sb3_combrel.common.suggestions import did_you_mean
+from sb3_combrel.sources.experience import KINDS, find_file, read_experience, read_file, read_named
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.sources.transitions import LEARNERS, make_env
+
+#: What a source may be given as, see :func:`find_source`; a Minari dataset as well.
+OneSource: TypeAlias = (
+    SourceInstances | str | os.PathLike[str] | Mapping[str, Any] | ReplayBuffer | BaseAlgorithm | pd.DataFrame
+)
 
 CACHE_VARIABLE = "SB3_COMBREL_CACHE"
 RENEW_VARIABLE = "SB3_COMBREL_RENEW"
@@ -31,86 +40,65 @@ DEFAULT_RECIPE: Mapping[str, Any] = {"n_instances": 1000, "total_timesteps": 30_
 _SEEN: set[Path] = set()
 
 
-def check_source(source: Any) -> None:
-    """Check that a source, or each of a list, can be found, without reading or learning it; raises as :func:`find_source`."""
+def checked_source(source: Any) -> Any:
+    """A source, or several, with what objects hold as instances; files are not read yet, and no task is learned.
+
+    :raises FileNotFoundError: as :func:`find_source`, ValueError as well
+    """
     if isinstance(source, Sequence) and not isinstance(source, str) and len(source) > 0:
-        for each in source:
-            check_source(each)
-    elif not isinstance(source, SourceInstances):
-        _file_or_recipe(source)
+        return [checked_source(each) for each in source]
+    if isinstance(source, str | os.PathLike):
+        if find_file(Path(source)) is not None or task_spec(str(source)) is not None:
+            return source
+        remedy = "; write one with SourceInstances.record(...).save(path), or with the command sb3-combrel record"
+        return read_named("source", source, remedy=remedy)
+    if (found := read_experience(source)) is not None:
+        return found
+    _complete(source)
+    return source
 
 
 def find_source(source: Any) -> SourceInstances:
-    """Read source instances from a file, or learn a task for them.
+    """Read source instances, or learn a task for them.
 
     What a recipe has made is kept in a file (see :func:`cache_file`) and read the next time; what is used, and from when, is
     printed. It is learned again if the environment's class or arguments have changed, and, once in a process, with
     ``renew: true`` in the recipe, or SB3_COMBREL_RENEW=1 among the environment variables.
 
-    :param source: source instances; the path of a file of them, or of a CSV file
-        (:meth:`~sb3_combrel.SourceInstances.from_table`); the id of an environment, learnt with
-        :data:`DEFAULT_RECIPE`, or, if variables have no bounds, by Fitted R-Max; or a recipe: a dict with ``env``, the id, and
-        arguments of :meth:`~sb3_combrel.SourceInstances.from_q_learning`, or, with ``learner: fitted_rmax``, of
-        :meth:`~sb3_combrel.SourceInstances.from_fitted_rmax`
+    :param source: what holds experience (see :func:`~sb3_combrel.sources.experience.read_experience`): source instances, a
+        file of them, a CSV file or a pandas DataFrame (:meth:`~sb3_combrel.SourceInstances.from_table`), a Minari dataset or
+        its id, a replay buffer, a model that has its experience, or the file of a saved one of this package; the id of an
+        environment, learnt with :data:`DEFAULT_RECIPE`, or, if variables have no bounds, by Fitted R-Max; or a recipe: a dict
+        with ``env``, the id, and arguments of :meth:`~sb3_combrel.SourceInstances.from_q_learning`, or, with
+        ``learner: fitted_rmax``, of :meth:`~sb3_combrel.SourceInstances.from_fitted_rmax`
     :raises FileNotFoundError: if there is neither a file nor a task of that name
     :raises ValueError: if it is none of these, or if the task cannot be learnt so
     """
+    source = checked_source(source)
     if isinstance(source, SourceInstances):
         return source
-    found = _file_or_recipe(source)
-    if not isinstance(found, Path):
-        return _learn_or_read(found)
-    return SourceInstances.from_table(found) if is_table(found) else SourceInstances.load(found)
-
-
-def is_table(path: Path) -> bool:
-    """Whether a file is a CSV file, compressed or not, by its name."""
-    return path.name.lower().endswith((".csv", ".txt", ".csv.gz", ".csv.zip"))
-
-
-def _file_or_recipe(source: Any) -> Path | dict[str, Any]:
-    """The file of a source, or the complete recipe by which it is learned."""
     if isinstance(source, str | os.PathLike):
-        path = Path(source)
-        for file in (path, path.with_name(path.name + ".npz") if path.name else path):
-            if file.is_file() and file.suffix.lower() == ".zip" and not is_table(file):
-                raise ValueError(
-                    f"source must be a file of instances, got {source}, a saved model: pass its experience, "
-                    f"FittedRMax.load({str(source)!r}).source_instances(), or what it does in its task, "
-                    "SourceInstances.record(model, env)"
-                )
-            if file.is_file():
-                return file
-        if task_spec(str(source)) is not None:
-            return {**DEFAULT_RECIPE, "env": str(source)}
-        if str(source) and path.is_dir():
-            raise ValueError(f"source must be a file of instances, or the id of an environment, got the folder {source}")
-        file = Path(str(source) or "source").with_suffix(".npz")
-        raise FileNotFoundError(
-            f"there is no source file {source}, looked for in {Path.cwd()}, and no environment of that name; write one with "
-            f"SourceInstances.record(...).save({str(file)!r}), or: sb3-combrel record combrel/MountainCar2D-v0 --output {file}"
-        )
-    if not isinstance(source, Mapping) or not source:
+        file = find_file(Path(source))
+        return _learn_or_read({**DEFAULT_RECIPE, "env": str(source)}) if file is None else read_file(file)
+    return _learn_or_read(_complete(source))
+
+
+def _complete(recipe: Any) -> dict[str, Any]:
+    """A recipe with what it leaves out."""
+    if not isinstance(recipe, Mapping) or not recipe:
+        act = hasattr(recipe, "predict") or callable(recipe)
         raise ValueError(
-            "source must be SourceInstances, a path to them, or a list of these; or a task to learn them from, the id of an "
-            f"environment or a recipe such as {{'env': 'MountainCar-v0'}}, got {reprlib.repr(source)}{_instead(source)}"
+            f"source must be {KINDS}, or a list of these; or a task to learn it from, the id of an environment or a recipe "
+            f"such as {{'env': 'MountainCar-v0'}}, got {reprlib.repr(recipe)}"
+            f"{': pass what it does, SourceInstances.record(model, env)' if act else ''}"
         )
-    if not isinstance(source.get("env"), str):
-        raise ValueError(f"the recipe of a source needs 'env', the id of its task, got {dict(source)!r}")
-    learner = source.get("learner", "q_learning")
+    if not isinstance(recipe.get("env"), str):
+        raise ValueError(f"the recipe of a source needs 'env', the id of its task, got {dict(recipe)!r}")
+    learner = recipe.get("learner", "q_learning")
     if learner not in LEARNERS:
         raise ValueError(f"the recipe's learner must be {' or '.join(LEARNERS)}, got {learner!r}")
     default = DEFAULT_RECIPE if learner == "q_learning" else {**DEFAULT_RECIPE, "total_timesteps": None}
-    return {name: value for name, value in {**default, **source}.items() if value is not None}
-
-
-def _instead(source: Any) -> str:
-    """Say how a table or a model becomes a source, if it is one."""
-    if hasattr(source, "columns") and hasattr(source, "iloc"):
-        return ": pass SourceInstances.from_table(table)"
-    if hasattr(source, "source_instances"):
-        return ": pass model.source_instances(), its experience"
-    return ": pass SourceInstances.record(model, env)" if hasattr(source, "predict") or callable(source) else ""
+    return {name: value for name, value in {**default, **recipe}.items() if value is not None}
 
 
 def _learn_or_read(recipe: Mapping[str, Any]) -> SourceInstances:

@@ -22,7 +22,7 @@ from sb3_combrel.common.files import write_whole
 from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.common.scaling import Bounds, StateScaling
 from sb3_combrel.common.serialisation import register_reader, register_writer
-from sb3_combrel.sources import minari_datasets, recording, tables
+from sb3_combrel.sources import minari_datasets, recording, replay_buffers, tables
 from sb3_combrel.sources.q_learning import learn_q_learning
 from sb3_combrel.sources.source_checks import action_array, checked_names, finite_array, terminal_flags
 from sb3_combrel.sources.subsets import check_method, covering_rows, random_rows
@@ -31,6 +31,7 @@ from sb3_combrel.sources.transitions import LEARNERS, Floats, as_transition_coun
 if TYPE_CHECKING:
     import pandas as pd
     from minari import MinariDataset
+    from stable_baselines3.common.buffers import ReplayBuffer
     from stable_baselines3.common.vec_env import VecEnv
 
 _MAX_ACTIONS = 1_000_000  # each action has a name
@@ -201,6 +202,23 @@ class SourceInstances:
         :raises ValueError: as of :meth:`record`
         """
         source = cls(*minari_datasets.read_dataset(dataset, bounds))
+        return source if n_instances is None else source.subset(n_instances, seed=seed)
+
+    @classmethod
+    def from_replay_buffer(
+        cls,
+        buffer: ReplayBuffer,
+        n_instances: int | None = None,
+        seed: int | None = None,
+        *,
+        bounds: Bounds | None = None,
+    ) -> SourceInstances:
+        """Take the transitions of a replay buffer of Stable-Baselines3, such as ``DQN(...).replay_buffer``.
+
+        :param buffer: of Box observations and Discrete actions; :meth:`from_minari` says what the others are
+        :raises ValueError: if it is empty, has other spaces, or does not keep where episodes ended
+        """
+        source = cls(*replay_buffers.read_buffer(buffer, bounds))
         return source if n_instances is None else source.subset(n_instances, seed=seed)
 
     @classmethod

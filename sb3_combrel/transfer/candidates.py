@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import copy
-import os
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -14,12 +13,11 @@ from sb3_combrel.common.periodic import differences
 from sb3_combrel.mappings.factored_mapping import FactoredMapping
 from sb3_combrel.mappings.inter_task_mapping import MappingNames
 from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet, resolve, with_numbers
-from sb3_combrel.sources.recipes import check_source, find_source
+from sb3_combrel.sources.recipes import OneSource, checked_source, find_source
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask
 
-OneSource = SourceInstances | str | os.PathLike[str] | Mapping[str, Any]
-SourceLike = OneSource | Sequence[OneSource]
+SourceLike: TypeAlias = OneSource | Sequence[OneSource]
 MappingsLike = str | InterTaskMapping | FactoredMapping | MappingSet | Mapping[str, Any] | Sequence[Any]
 
 MAX_WHOLE_MAPPINGS = 20_000  # compliance is stored with every candidate, for thousands of transitions
@@ -180,7 +178,7 @@ class Candidates:
 
 def load_sources(source: SourceLike) -> list[SourceInstances]:
     """Return the instances of one source or of several, see :func:`~sb3_combrel.sources.recipes.find_source`."""
-    check_source(source)
+    source = checked_source(source)
     if isinstance(source, Sequence) and not isinstance(source, str):
         return [instances for one in source for instances in load_sources(one)]
     return [find_source(source)]

@@ -309,7 +309,7 @@ def test_a_pickle_is_never_read(tmp_path):
 def test_files_that_others_read_are_named_with_who_reads_them(tmp_path):
     for name in ("log.parquet", "log.json", "log.TSV"):
         (tmp_path / name).write_text("x")
-        with pytest.raises(ValueError, match=f"read .*{name} with pandas, and pass the DataFrame"):
+        with pytest.raises(ValueError, match=f"{name} must be .*read it with pandas, and pass the DataFrame"):
             model().load_instances(tmp_path / name)
     (tmp_path / "log.csv").write_text("s0,action,reward\n")
     with pytest.raises(ValueError, match=r"or read a table with SourceInstances.from_table\(path\)"):
@@ -318,7 +318,7 @@ def test_files_that_others_read_are_named_with_who_reads_them(tmp_path):
         with pytest.raises(ValueError, match="instances must be a file, got the folder"):
             model().load_instances(folder)
     empty = ReplayBuffer(10, Walk().observation_space, Walk().action_space)
-    with pytest.raises(ValueError, match="instances must be transitions, got a ReplayBuffer that is empty"):
+    with pytest.raises(ValueError, match="must hold transitions, got a ReplayBuffer that is empty"):
         model().load_instances(empty)
 
 

@@ -3,17 +3,23 @@
 import os
 import time
 from dataclasses import replace
+from functools import partial
 
 import gymnasium
 import numpy as np
 import pytest
+from helpers.dashboard import NamedWalk
 from helpers.sources import assert_same, some_source
 from helpers.walk import Walk, small, walk_source
+from stable_baselines3 import DQN
 
-from sb3_combrel import COMBREL, TIMBREL, FittedRMax, SourceInstances
+from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping, SourceInstances
 from sb3_combrel.common.version import __version__
 from sb3_combrel.sources import recipes
-from sb3_combrel.sources.recipes import check_source, find_source, task_spec
+from sb3_combrel.sources.recipes import checked_source, find_source, task_spec
+from sb3_combrel.transfer.methods.experts import MappingExperts
+from sb3_combrel.transfer.methods.soft_homomorphism import SoftHomomorphism
+from sb3_combrel.transfer.methods.three_way_rbm import ThreeWayRBM
 from sb3_combrel.transfer.report import describe_sources
 
 WALK = "WalkForRecipes-v0"
@@ -155,12 +161,12 @@ def test_files_tasks_and_instances_may_be_listed_together_and_are_saved_with_the
     ("source", "error", "message"),
     [
         *(
-            (name, FileNotFoundError, "there is no source file .*and no environment of that name")
+            (name, FileNotFoundError, "there is no file .*and no environment or Minari dataset of that name")
             for name in ("nowhere.npz", "Nowhere-v0", "no_such_package:Task-v0", "combrel/Nowhere-v0", "")
         ),
         ({"n_instances": 3}, ValueError, "the recipe of a source needs 'env'"),
         ({"env": WALK, "learner": "sarsa"}, ValueError, "learner must be q_learning or fitted_rmax, got 'sarsa'"),
-        (7, ValueError, "source must be SourceInstances, a path to them, or a list of these"),
+        (7, ValueError, "source must be SourceInstances, a file .*or a list of these"),
         ([], ValueError, "source must be SourceInstances"),
     ],
 )
@@ -174,7 +180,7 @@ def test_what_is_no_source_is_refused_at_construction(source, error, message):
 def test_a_path_that_goes_before_it_is_read_is_named(tmp_path):
     file, transfer = some_source().save(tmp_path / "source.npz"), COMBREL(tmp_path / "source")
     file.unlink()
-    with pytest.raises(FileNotFoundError, match=r"no source file .*source"):
+    with pytest.raises(FileNotFoundError, match=r"no file .*source"):
         small(transfer=transfer)
 
 
@@ -191,20 +197,44 @@ def test_specifications_of_tasks():
     assert task_spec(WALK).id == WALK and task_spec("combrel/MountainCar2D-v0").id == "combrel/MountainCar2D-v0"
     assert task_spec("combrel_envs:combrel/MountainCar2D-v0").id == "combrel/MountainCar2D-v0"
     assert task_spec("Nowhere-v0") is None and task_spec("source.npz") is None
-    check_source("combrel/MountainCar2D-v0")
+    checked_source("combrel/MountainCar2D-v0")
 
 
-def test_what_is_no_source_yet_is_told_how_it_becomes_one(tmp_path):
+def test_what_a_learner_takes_as_past_data_is_a_source_too(tmp_path):
+    """Read at construction where it is in memory, of a file when learning starts; and saved with the model."""
     model = small(Walk()).learn(20)
-    with pytest.raises(ValueError, match=r"pass SourceInstances\.from_table\(table\)$"):
-        check_source(walk_source().to_table())
-    with pytest.raises(ValueError, match=r"pass model\.source_instances\(\), its experience$"):
-        check_source(model)
-    with pytest.raises(ValueError, match=r"pass SourceInstances\.record\(model, env\)$"):
-        check_source(lambda state: 0)
+    experience = model.source_instances()
     model.save(tmp_path / "walk")
-    with pytest.raises(ValueError, match=r"a saved model: pass its experience, FittedRMax\.load\(.*walk\.zip'\)"):
-        check_source(str(tmp_path / "walk.zip"))
+    experience.to_table().to_csv(tmp_path / "log.csv", index=False)
+    for given in (model, experience.to_table(), tmp_path / "walk", str(tmp_path / "walk.zip"), tmp_path / "log.csv"):
+        np.testing.assert_allclose(find_source(given).states, experience.states, atol=1e-12)
+        assert len(COMBREL([given, walk_source()]).source) == 2
+    learner = FittedRMax(Walk(), transfer=COMBREL(model, use="instances"), seed=0)
+    assert len(learner.transfer.sources[0]) == 20
+    model.learn(20)
+    assert len(learner.transfer.sources[0]) == 20, "as it was"
+
+
+def test_a_replay_buffer_is_a_source_with_the_names_of_its_models_task():
+    dqn = DQN("MlpPolicy", NamedWalk(), learning_starts=10, buffer_size=60, seed=0).learn(90)
+    identity = InterTaskMapping([0, 1], [0, 1])
+    for kind in (COMBREL, partial(TIMBREL, mappings=identity), MappingExperts, SoftHomomorphism, ThreeWayRBM):
+        of_model, of_buffer = (kind(given).source for given in (dqn, dqn.replay_buffer))
+        np.testing.assert_array_equal(of_model.states, of_buffer.states)
+        assert len(of_model) == 60 and of_model.origin["recorder"] == "DQN" and of_buffer.state_names == ("s0", "s1")
+        assert (of_model.state_names, of_model.action_names) == (NamedWalk.state_names, NamedWalk.action_names)
+        np.testing.assert_array_equal(of_buffer.low, Walk().observation_space.low)
+    assert len(SourceInstances.from_replay_buffer(dqn.replay_buffer, 7, seed=0)) == 7
+    narrow = SourceInstances.from_replay_buffer(dqn.replay_buffer, bounds=([-3.0, -3.0], [3.0, 3.0]))
+    np.testing.assert_array_equal(narrow.low, [-3.0, -3.0])
+
+
+def test_what_has_no_experience_is_told_how_it_becomes_a_source():
+    for model in (lambda state: 0, DQN("MlpPolicy", Walk(), buffer_size=10)):
+        with pytest.raises(ValueError, match=r"pass what it does, SourceInstances\.record\(model, env\)$"):
+            checked_source(model)
+    with pytest.raises(ValueError, match="no experience yet"):
+        checked_source(small(Walk()))
 
 
 def test_a_compressed_table_is_a_source(tmp_path):

@@ -88,7 +88,7 @@ def test_a_source_that_is_missing_damaged_or_of_another_task_is_refused(method, 
     path.write_bytes(b"not a source")
     refused(lambda: method(path), "source.npz", "not source instances")
     for nothing in ([], None, 5, {}):
-        refused(lambda: method(nothing), "source must be SourceInstances, a path", repr(nothing))  # noqa: B023
+        refused(lambda: method(nothing), "source must be SourceInstances, a file", repr(nothing))  # noqa: B023
 
 
 BAD_ARGUMENTS = {

@@ -10,6 +10,7 @@ import numpy as np
 from sb3_combrel.common.checks import check_count, check_finite, check_positive
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
+from sb3_combrel.sources.recipes import checked_source
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.candidates import MappingsLike, SourceLike, load_sources, loaded, resolved_sets
 from sb3_combrel.transfer.prior.prior_sets import is_factored
@@ -89,6 +90,7 @@ class MappingExperts(Transfer):
     _policies: list[SourcePolicy] = field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
+        self.source = checked_source(self.source)
         check_count("max_experts", self.max_experts)
         check_finite("exploration", self.exploration, min=0.0)
         if self.patience is not None:

@@ -12,6 +12,7 @@ import numpy as np
 from sb3_combrel.common.checks import check_boolean, check_count, check_positive
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
+from sb3_combrel.sources.recipes import checked_source
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.candidates import SourceLike, load_one_source
@@ -79,6 +80,7 @@ class LearnedTranslation(Transfer):
     transfer_terminals: bool = True
 
     def __post_init__(self) -> None:
+        self.source = checked_source(self.source)
         check_count("n_random_steps", self.n_random_steps, min=MIN_SAMPLES)
         check_count("n_source_samples", self.n_source_samples, min=MIN_SAMPLES)
         check_positive("breadth", self.breadth)

@@ -17,7 +17,7 @@ from sb3_combrel.common.transferred import PriorPredictions, TransferredInstance
 from sb3_combrel.mappings.action_mappings import AllActionMappings
 from sb3_combrel.mappings.mapping_set import MappingSet
 from sb3_combrel.mappings.named_sets import check_mappings
-from sb3_combrel.sources.recipes import check_source
+from sb3_combrel.sources.recipes import checked_source
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.candidates import Candidate, Candidates, MappedVariables, MappingsLike, SourceLike, loaded
@@ -45,8 +45,9 @@ MAX_ACTION_MAPPINGS = 100_000  # action mappings that are restricted as a whole 
 class MappingTransfer(Transfer):
     """Transfers from sources through mappings: translated instances, or the sources' own model as the prior of the target's.
 
-    :param source: source instances, a path to them, or a list of several; or the id of an environment, which is then learned
-        by Q-learning (30,000 steps, 1000 instances) when first needed, and kept in a file; or a recipe, ``{"env":
+    :param source: what holds experience of another task: source instances, a file or a pandas DataFrame of them, a Minari
+        dataset, a replay buffer, a model that has its experience; or a list of several; or the id of an environment, which is
+        then learned by Q-learning (30,000 steps, 1000 instances) when first needed, and kept in a file; or a recipe, ``{"env":
         "MountainCar-v0", "total_timesteps": 50_000}``: :func:`~sb3_combrel.sources.recipes.find_source`
     :param mappings: the name of a set: "injective" (each source variable is mapped to by one target variable, the others are
         left unmapped), "surjective", "all", "balanced", these with ``signed_`` before them (variables may be mirrored as
@@ -99,7 +100,7 @@ class MappingTransfer(Transfer):
         meaningless = ", ".join(f"{name}={getattr(self, name)!r}" for name in self._of_instances())
         if self.use == "prior" and meaningless:
             raise ValueError(f'{meaningless} must be left out with use="prior": it has a meaning for use="instances" alone')
-        check_source(self.source)
+        self.source = checked_source(self.source)
         check_mappings(self.mappings)
         check_positive("source_breadth", self.source_breadth)
         check_positive("breadth", self.breadth)

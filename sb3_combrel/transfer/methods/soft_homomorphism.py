@@ -10,6 +10,7 @@ import numpy as np
 from sb3_combrel.common.checks import check_boolean, check_count, check_positive
 from sb3_combrel.common.periodic import differences
 from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
+from sb3_combrel.sources.recipes import checked_source
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.candidates import SourceLike, load_one_source, stacked_instances
 from sb3_combrel.transfer.methods import soft_mapping as soft
@@ -70,6 +71,7 @@ class SoftHomomorphism(Transfer):
     source_breadth: float = DEFAULT_SOURCE_BREADTH
 
     def __post_init__(self) -> None:
+        self.source = checked_source(self.source)
         check_count("n_copies", self.n_copies, none_allowed=True)
         check_count("n_starts", self.n_starts)
         check_count("max_transitions", self.max_transitions, min=FIRST_RENEWAL)
