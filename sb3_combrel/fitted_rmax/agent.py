@@ -17,13 +17,7 @@ from typing import Any
 import numpy as np
 
 from sb3_combrel.common.checks import check_resolution
-from sb3_combrel.common.constants import (
-    COARSE,
-    LINES_AGAIN,
-    LONGEST_PLAN,
-    SWEEPS_A_STEP,
-    SWEEPS_AT_EPISODE_END,
-)
+from sb3_combrel.common.constants import COARSE, LINES_AGAIN, LONGEST_PLAN, SWEEPS_A_STEP, SWEEPS_AT_EPISODE_END
 from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task

@@ -75,6 +75,3 @@ class NoTransfer(Transfer):
 
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         pass
-
-    def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
-        return TransferredInstances.empty(len(actions), states.shape[1])

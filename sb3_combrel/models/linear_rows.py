@@ -231,13 +231,8 @@ def update_rows(experience, linear, pairs, mdp, grid, kernel, planned, which, tr
     """
     instances = Instances(*experience[0])
     experience = instances, Instances(*experience[1]), Ends(*experience[2])
-    linear, pairs, mdp, grid, kernel = (
-        LinearArrays(*linear),
-        PairArrays(*pairs),
-        MDPArrays(*mdp),
-        GridArrays(*grid),
-        Kernel(*kernel),
-    )
+    linear, pairs, kernel = LinearArrays(*linear), PairArrays(*pairs), Kernel(*kernel)
+    mdp, grid = MDPArrays(*mdp), GridArrays(*grid)
     transferred, row_scratch = TransferredInstances(*transferred), RowScratch(*row_scratch)
     fit, scratch = LocalFit(*fit), LinearScratch(*scratch)
     gamma, threshold, has_prior, transitions = planned

@@ -6,27 +6,14 @@ import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
 from sb3_combrel.transfer.report import NotBoundError, TransferReport
-
-if TYPE_CHECKING:
-    from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
-
-
-#: What an algorithm, or this package, calls of a transfer method; ``dir`` leaves it out.
-FOR_THE_ALGORITHM = frozenset(
-    (
-        *("bind", "transferred", "transferred_to_sample", "observe", "end_episode", "changed", "prior", "prior_version"),
-        *("check_degree", "note_use", "lowest_reward", "get_state", "set_state", "rng", "makes_choices"),
-        *("informs_model", "value_bound", "note_prediction", "change_optimism"),
-    )
-)
-
 
 #: How a model may use the source, see :attr:`Transfer.use`.
 USES = ("instances", "prior", "actions")
@@ -64,7 +51,7 @@ class Transfer(ABC):
     """A transfer method: it observes transitions of the target task, and returns instances for states and actions of it.
 
     It is asked where the target's own instances do not suffice. A transfer object given to an algorithm is a description: the
-    algorithm binds a copy of it to its task. Only :meth:`transferred` and :meth:`observe` have to be written. States and
+    algorithm binds a copy of it to its task. Only :meth:`observe`, and what :attr:`use` names, have to be written. States and
     effects are in unit coordinates of the target, ``task.scaling``.
     """
 
@@ -92,7 +79,6 @@ class Transfer(ABC):
         self.task = task
         self.rng = rng
 
-    @abstractmethod
     def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
         """Return instances for states and actions.
 
@@ -101,7 +87,11 @@ class Transfer(ABC):
         :param own_weight: sum of the kernel weights of the target's own instances there, shape (n,)
         :return: for each pair instances whose weights and ``own_weight`` together reach ``task.exploration_threshold``, or
             none, which leaves it optimistic; good until the next call
+        :raises NotImplementedError: if :attr:`use` is "instances", and the method has none
         """
+        if self.use == "instances":
+            raise NotImplementedError(f"{type(self).__name__} has no method transferred(states, actions, own_weight)")
+        return TransferredInstances.empty(len(actions), states.shape[1])
 
     def transferred_to_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
         """As :meth:`transferred`, for states of the finite sample; a method may store results by state.
@@ -158,9 +148,10 @@ class Transfer(ABC):
         """Say where the instances may differ from those returned before; called after each transition and each episode.
 
         :param known: bool, shape (n_actions, n_points): pairs whose own instances suffice, which may be left out
-        :return: True: everywhere; False: nowhere; or bool, shape (n_actions, n_points). By default everywhere
+        :return: True: everywhere; False: nowhere; or bool, shape (n_actions, n_points). By default everywhere,
+            if there are any instances
         """
-        return True
+        return self.use == "instances"
 
     def prior(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions:
         """Predict states and actions of the target; asked only if :attr:`use` is "prior".
@@ -272,11 +263,6 @@ class Transfer(ABC):
         told = self.always_shown
         shown = [f"{name}={value!r}" for name, value in given.items() if name in told or not _equal(value, defaults.get(name))]
         return f"{type(self).__name__}({', '.join(shown)})"
-
-    def __dir__(self) -> list[str]:
-        """Names for the user: without those that begin with an underscore, and those that only an algorithm calls."""
-        names = {name for name in super().__dir__() if name.startswith("__") or not name.startswith("_")}
-        return sorted(names - FOR_THE_ALGORITHM)
 
 
 def _equal(value: Any, default: Any) -> bool:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled, inlined
+from sb3_combrel.common.compiled import compiled, entry_point, inlined
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.kernels import nearest_instances
 from sb3_combrel.common.regression import Kernel, LocalFit, fit_around, known_weight, number_at
@@ -72,16 +72,13 @@ def beyond_data(fit):
     return max(0.0, fit.solution[0, len(fit.z)] * fit.factor[0, 0] * fit.factor[0, 0] - 1.0)
 
 
-@compiled
+@entry_point
 def predict_many(source, states, actions, predictions):
     """Predict many states and actions; ``source``: ``SourceModel.plain``, ``predictions``: SourcePredictions as a tuple."""
     instances, kernel, fit, away = source_arrays(source)
     effect, reward, end, weight = predictions
     for i in range(len(actions)):
         reward[i], end[i], weight[i] = predict_source(instances, kernel, fit, away, actions[i], states[i], effect[i])
-
-
-_predict_many = EntryPoint(predict_many)
 
 
 class SourceModel:
@@ -114,5 +111,5 @@ class SourceModel:
         """Predict n states and actions of the source; unit coordinates of it, and int64."""
         n = len(actions)
         found = SourcePredictions(np.empty((n, self.n_variables)), np.empty(n), np.empty(n), np.empty(n))
-        _predict_many.call(self.plain, np.ascontiguousarray(states), actions, tuple(found))
+        predict_many.call(self.plain, np.ascontiguousarray(states), actions, tuple(found))
         return found

@@ -36,7 +36,7 @@ def compiled_tables(sample, sources, sets, bandwidths, min_evidence=GUARD, start
     scratch = ComplianceScratch.for_mappings(table, instances, bandwidths.start if starts is None else starts, min_evidence)
     given = tuple(instances), tuple(table), tuple(bandwidths), tuple(scratch)
     for state, effect, reward, found in zip(sample.state, sample.effect, sample.reward.tolist(), tables, strict=True):
-        transition_compliance(state, effect, reward, *given, found)
+        transition_compliance.call(state, effect, reward, *given, found)
     return tables
 
 
@@ -46,8 +46,8 @@ def compiled_relevances(sample, source, mapping, action, bandwidths, mu):
     found, near, evidence = np.full((3, int(instances.size.max())), np.nan)
     target, scratch = (of_action.state, of_action.effect, of_action.reward), np.empty(len(of_action.reward))
     given = instances, source_action, (mapping.state_index, mapping.state_sign, np.zeros(len(mapping.state), bool)), bandwidths
-    relevance(target, *given, mu, scratch, found)
-    near_relevance(target, *given, scratch, evidence, near)
+    relevance.call(target, *given, mu, scratch, found)
+    near_relevance.call(target, *given, scratch, evidence, near)
     order = naive.places_of(source, instances)[source.actions == source_action]
     return found[order], near[order]
 

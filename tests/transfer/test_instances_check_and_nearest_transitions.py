@@ -198,7 +198,7 @@ def shares(near, cache, n_candidates, n_before=5):
     draws, choice = (np.arange(N_DRAWS) + 0.5) / N_DRAWS, np.full(2 * N_DRAWS, -7)
     first, actions = np.array([0, n_before, n_before + n_candidates]), np.ones(N_DRAWS, dtype=np.int64)
     rows, each_near = np.arange(N_DRAWS, 2 * N_DRAWS), np.tile(near, (2 * N_DRAWS, 1))
-    choose(rows, actions, each_near, tuple(cache), first, draws, choice)
+    choose.call(rows, actions, each_near, tuple(cache), first, draws, choice)
     assert (choice[:N_DRAWS] == -7).all()
     chosen = np.where(choice[N_DRAWS:] < 0, n_candidates, choice[N_DRAWS:] - n_before)
     return np.bincount(chosen, minlength=n_candidates + 1) / N_DRAWS
@@ -228,16 +228,16 @@ def test_at_a_sample_state_the_choice_is_the_same_as_on_the_grid(seed, drawn, pe
     due = np.zeros((n_actions, len(POINTS)), dtype=bool)
     sample = np.ascontiguousarray(POINTS.T), np.array(periodic)
     for i, action in enumerate(actions):
-        add_to_sample(i, states[i], sample, near[action], distance[action], due[action], np.empty(len(POINTS)))
+        add_to_sample.call(i, states[i], sample, near[action], distance[action], due[action], np.empty(len(POINTS)))
     np.testing.assert_array_equal(due, near[:, :, 0] >= 0)
     on_grid, each = np.full(n_actions * len(POINTS), -1), np.repeat(np.arange(n_actions), len(POINTS))
     of_pairs = draws[each] if drawn else draws
-    choose(np.arange(len(on_grid)), each, near.reshape(-1, 3), tuple(cache), first, of_pairs, on_grid)
+    choose.call(np.arange(len(on_grid)), each, near.reshape(-1, 3), tuple(cache), first, of_pairs, on_grid)
     recorded = states, *by_action(actions, n_actions), np.array(periodic)
     for p, state in enumerate(POINTS):
         asked = np.tile(state, (n_actions, 1)), np.arange(n_actions), np.zeros(n_actions)
         found = room_for(n_actions)
-        assert select(asked, recorded, (1.0, limit), tuple(cache), first, draws, found)
+        assert select.call(asked, recorded, (1.0, limit), tuple(cache), first, draws, found)
         np.testing.assert_array_equal(found[0], near[:, p])
         np.testing.assert_array_equal(np.sort(found[0], axis=1), nearest(state, states, actions, periodic, limit))
         np.testing.assert_array_equal(candidates_of(found), on_grid.reshape(n_actions, -1)[:, p])
@@ -285,7 +285,7 @@ def test_nothing_is_selected_before_all_neighbors_have_been_measured():
     found[2][:], found[3][:] = 7, 7
     for i, complete in ((2, False), (0, True)):
         cache.measured[:] = [True, True, i != 2]
-        assert select(query, recorded, (1.0, 1.0), tuple(cache), np.array([0, 2, 4]), np.empty(0), found) == complete
+        assert select.call(query, recorded, (1.0, 1.0), tuple(cache), np.array([0, 2, 4]), np.empty(0), found) == complete
         assert found[0].tolist() == [[0, -1, -1], [1, 2, -1]], "what is to be measured"
         assert (found[2] == 7).all() != complete
 
@@ -301,7 +301,7 @@ def test_the_best_candidate_is_the_best_mapping_of_algorithm_1(seed, n_candidate
     transitions = equations.Transitions(sample, actions, np.zeros((20, 2)), np.zeros(20), np.zeros(20, dtype=bool))
     query, first = (rng.random((8, 2)), np.tile(np.arange(2), 4), np.zeros(8)), np.array([0, n_candidates, 2 * n_candidates])
     found, recorded = room_for(8, k), (sample, *by_action(actions, 2), NOT_PERIODIC)
-    assert select(query, recorded, (1.0, np.inf), tuple(cache), first, np.empty(0), found)
+    assert select.call(query, recorded, (1.0, np.inf), tuple(cache), first, np.empty(0), found)
     for state, action, chosen in zip(query[0], query[1], candidates_of(found), strict=True):
         near = equations.nearest_transitions(state, action, transitions, k)
         best = equations.best_mapping(cache.compliance[near, :n_candidates], least)

@@ -214,13 +214,6 @@ def test_an_object_shows_its_arguments():
     assert repr(Mine()) == "Mine()" and repr(Mine(3.0)) == "Mine(reward=3.0)"
 
 
-def test_dir_has_what_is_for_the_user():
-    names = {name for name in dir(COMBREL(SOURCE)) if not name.startswith("__")}
-    assert {"report", "describe_prior", "mapping_counts", "source", "mappings", "use"} <= names
-    assert not {"bind", "observe", "transferred", "set_state", "note_use"} & names
-    assert not any(name.startswith("_") for name in names)
-
-
 def test_it_says_why_the_sources_values_bound_nothing():
     def report_of(source):
         env = NamedWalk()

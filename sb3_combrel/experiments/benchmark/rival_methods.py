@@ -125,7 +125,7 @@ class BellmanConsistent(MASTER):
         periodic = np.array(task.periodic)
         successors = np.where(periodic, (states + effects) % 1.0, np.clip(states + effects, 0.0, 1.0))
         gamma = min(task.gamma, LARGEST_GAMMA)
-        discount = np.where(seen.ended[: seen.n] == seen.TERMINATED, 0.0, gamma)
+        discount = np.where(seen.ended[: seen.n], 0.0, gamma)
         found = np.zeros((len(copies), task.n_actions, copies.most_actions))
         policies = [SourcePolicy(source, gamma, float(self.source_breadth)) for source in self.sources]
         for copy, number in enumerate(copies.source.tolist()):

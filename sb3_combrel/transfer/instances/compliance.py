@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled, compiled_fast, inlined
+from sb3_combrel.common.compiled import compiled_fast, entry_point
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.periodic import difference, flag_array
 from sb3_combrel.transfer.candidates import Candidates, MappingTable
@@ -45,7 +45,6 @@ class ComplianceScratch(NamedTuple):
     reward: np.ndarray  # float64, shape (n,): the same for rewards
     weight: np.ndarray  # float64, shape (n,): product of a mapping's start kernels
     hit: np.ndarray  # the same of its outcome kernels
-    still: np.ndarray  # float64, shape (n_state_mappings,): outcome kernel of the variables predicted not to change
     min_evidence: float  # sum of start kernels below which a mapping has no compliance
     periodic: np.ndarray  # bool, shape (n_target_variables,)
 
@@ -69,7 +68,7 @@ class ComplianceScratch(NamedTuple):
                 factors.append(number.setdefault((int(v), int(index[v]), bool(sign[v] < 0.0)), len(number)))
                 starts.append(start_number.setdefault((factors[-1], bandwidth), len(start_number)))
             first.append(len(factors))
-        n_mappings, keys = len(mappings.variable), list(number)
+        keys = list(number)
         return cls(
             variable=np.array([v for v, _, _ in keys], dtype=np.int64),
             source=np.array([k for _, k, _ in keys], dtype=np.int64),
@@ -86,7 +85,6 @@ class ComplianceScratch(NamedTuple):
             reward=np.empty(largest),
             weight=np.empty(largest),
             hit=np.empty(largest),
-            still=np.empty(n_mappings),
             min_evidence=float(min_evidence),
             periodic=flag_array(periodic, mappings.variable.shape[1]),
         )
@@ -189,18 +187,7 @@ def _mapping_compliance(m, n, scratch):
     return (transition / total) * (rewarded / total)
 
 
-@inlined
-def _still_factors(effect, mappings, bandwidth, still):
-    """Write to ``still`` the outcome kernel of each mapping's unmapped variables, which are predicted not to change."""
-    for m in range(mappings.variable.shape[0]):
-        missed = 0.0
-        for v in range(len(effect)):
-            if mappings.variable[m, v] < 0:
-                missed += effect[v] * effect[v]
-        still[m] = np.exp(-missed / bandwidth)
-
-
-@compiled
+@entry_point
 def transition_compliance(state, effect, reward, source, mappings, bandwidths, scratch, table):
     """Compute the compliance of one target transition through every state mapping, for every source action (Eq. 5).
 
@@ -212,14 +199,15 @@ def transition_compliance(state, effect, reward, source, mappings, bandwidths, s
     """
     source, mappings, scratch = Instances(*source), MappingTable(*mappings), ComplianceScratch(*scratch)
     bandwidths = Bandwidths(*bandwidths)
-    _still_factors(effect, mappings, bandwidths.outcome, scratch.still)
     for action in range(len(source.size)):
         _kernel_factors(state, effect, reward, source, action, bandwidths, scratch)
         for m in range(mappings.variable.shape[0]):
-            table[m, action] = scratch.still[m] * _mapping_compliance(m, source.size[action], scratch)
-
-
-_transition_compliance = EntryPoint(transition_compliance)
+            missed = 0.0
+            for v in range(len(effect)):
+                if mappings.variable[m, v] < 0:
+                    missed += effect[v] * effect[v]
+            still = np.exp(-missed / bandwidths.outcome)
+            table[m, action] = still * _mapping_compliance(m, source.size[action], scratch)
 
 
 class ComplianceTable:
@@ -241,7 +229,7 @@ class ComplianceTable:
     def measure(self, transitions: RecordedTransitions, i: int) -> None:
         """Compute the compliance of transition ``i``."""
         transition = transitions.states[i], transitions.effects[i], float(transitions.rewards[i])
-        _transition_compliance.call(*transition, *self._given)
+        transition_compliance.call(*transition, *self._given)
 
     def no_change(self, transitions: RecordedTransitions, i: int) -> float:
         """Compliance with the prediction of no change, and of each of the source's rewards as often as it occurs there."""

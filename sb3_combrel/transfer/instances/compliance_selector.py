@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint
 from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.instances.compliance import ComplianceTable
@@ -19,8 +18,6 @@ CHOICE_GROWTH = 1.2
 # The confidence in choices is averaged over so many states of the sample, at most, evenly spread.
 MAX_COMPARED = 500
 NO_DRAWS = np.empty(0)
-
-_add_to_sample, _choose, _select = EntryPoint(add_to_sample), EntryPoint(choose), EntryPoint(select)
 
 
 @dataclass(frozen=True)
@@ -132,7 +129,7 @@ class ComplianceSelector(Selector):
         near, _, first, last = self._found_at
         query = states, actions, own_weight
         recorded = self.transitions.states, self._listed, self._n_listed, self._periodic
-        while not _select.call(query, recorded, self._limits, self._plain_cache, self.first, self._draws_at, self._found_at):
+        while not select.call(query, recorded, self._limits, self._plain_cache, self.first, self._draws_at, self._found_at):
             self._measure(near[:n])
         return first[:n], last[:n]
 
@@ -159,7 +156,7 @@ class ComplianceSelector(Selector):
             self._listed[action, n] = i
             self._n_listed[action] += 1
             near, distance, due = self._near[action], self._distance[action], self._due[action]
-            _add_to_sample.call(i, self.transitions.states[i], self._sample, near, distance, due, self._apart)
+            add_to_sample.call(i, self.transitions.states[i], self._sample, near, distance, due, self._apart)
 
     def _renew(self, pairs: np.ndarray) -> np.ndarray:
         """Renew the choices of pairs of the sample; return those that changed."""
@@ -167,7 +164,7 @@ class ComplianceSelector(Selector):
         self._measure(near[pairs])
         rows, actions = pairs.copy(), pairs // len(self.task.sample_states)
         draws = self._draws(len(pairs))
-        n_changed = int(_choose.call(rows, actions, near, self._plain_cache, self.first, draws, self._choice))
+        n_changed = int(choose.call(rows, actions, near, self._plain_cache, self.first, draws, self._choice))
         self._due.ravel()[pairs] = False
         self.n_switches += n_changed
         return rows[:n_changed]

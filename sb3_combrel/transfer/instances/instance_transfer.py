@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
+from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.transfer.instances.instances_check import InstancesCheck
 from sb3_combrel.transfer.instances.selectors import Confidence, Ranges, Selector
 from sb3_combrel.transfer.instances.translation import Translator
@@ -28,9 +28,6 @@ class InstanceTransfer:
     :param measure_relevance: writes to ``values`` the relevance of each candidate's instances to the first ``n_used``
         recorded transitions; used where the translator's instances come in the order of it
     """
-
-    #: There is no prior.
-    version = 0
 
     def __init__(
         self, selector: Selector, translator: Translator, *, breadth_decay: float, measure_relevance: Callable[..., None]
@@ -79,12 +76,6 @@ class InstanceTransfer:
             self.all_changed = False
             return True
         return of_selector
-
-    def predict(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions:
-        raise NotImplementedError('there is no prior with use="instances"')
-
-    def value_bound(self) -> None:
-        return None
 
     def observe(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool) -> None:
         """Take in a transition of the target; ``effect``: next state minus state, unit coordinates, shape (n_variables,)."""

@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled, inlined
-from sb3_combrel.common.kernels import any_periodic, squared_distance
+from sb3_combrel.common.compiled import compiled, entry_point, inlined
+from sb3_combrel.common.kernels import any_periodic, insert_by_distance, squared_distance
 from sb3_combrel.common.periodic import difference
 
 
@@ -33,7 +33,7 @@ class ComplianceCache(NamedTuple):
         )
 
 
-@compiled
+@entry_point
 def add_to_sample(i, state, sample, near, distance, due, apart):
     """Add transition ``i`` to the nearest ones of every sample state that has it among them.
 
@@ -59,20 +59,8 @@ def add_to_sample(i, state, sample, near, distance, due, apart):
                 apart[p] += along * along
     for p in range(n_points):
         if apart[p] < distance[p, last]:
-            add_neighbor(i, apart[p], near[p], distance[p])
+            insert_by_distance(near[p], distance[p], last + 1, i, apart[p])
             due[p] = True
-
-
-@compiled
-def add_neighbor(i, apart, near, distance):
-    """Add a transition to the nearest of one state, the nearest first; the last one leaves."""
-    k = len(near) - 1
-    while k > 0 and distance[k - 1] > apart:
-        distance[k] = distance[k - 1]
-        near[k] = near[k - 1]
-        k -= 1
-    distance[k] = apart
-    near[k] = i
 
 
 @inlined
@@ -101,7 +89,7 @@ def find_nearest(query, recorded, limits, near, distance):
             i = listed[action, n]
             apart = squared_distance(at[i], states[r], periodic, wraps)
             if apart < distance[r, last]:
-                add_neighbor(i, apart, near[r], distance[r])
+                insert_by_distance(near[r], distance[r], last + 1, i, apart)
 
 
 @compiled
@@ -149,7 +137,7 @@ def same_neighbors(near, others):
     return True
 
 
-@compiled
+@entry_point
 def choose(rows, actions, near, cache, first, draws, choice):
     """Renew the choices of some rows; those for which it changed are moved to the front of ``rows``.
 
@@ -180,7 +168,7 @@ def choose(rows, actions, near, cache, first, draws, choice):
     return n_changed
 
 
-@compiled
+@entry_point
 def select(query, recorded, limits, cache, first, draws, found):
     """Choose candidates for exact states and actions (lines 17-20), if all that are needed have been measured.
 

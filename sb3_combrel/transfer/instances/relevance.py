@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled
+from sb3_combrel.common.compiled import compiled, entry_point
 from sb3_combrel.common.periodic import difference
 from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
@@ -35,12 +35,12 @@ def renew_relevance(
         of_row = bandwidths.of_all._replace(start=float(bandwidths.starts[row]))
         target, source_action = of_actions[origin.target_action], candidates.arrays.action[c]
         if mu is None:
-            _near_relevance.call(target, candidates.instances, source_action, mapping, of_row, weight, evidence, values[c])
+            near_relevance.call(target, candidates.instances, source_action, mapping, of_row, weight, evidence, values[c])
         else:
-            _relevance.call(target, candidates.instances, source_action, mapping, of_row, mu, weight, values[c])
+            relevance.call(target, candidates.instances, source_action, mapping, of_row, mu, weight, values[c])
 
 
-@compiled
+@entry_point
 def relevance(target, source, action, mapping, bandwidths, mu, weight, values):
     """Compute ``equations.source_relevances``, through one state mapping.
 
@@ -60,7 +60,7 @@ def relevance(target, source, action, mapping, bandwidths, mu, weight, values):
         values[j] = 1.0 if off == 0.0 else (0.0 if distance == 0.0 else np.exp(-(off / distance) * (off / distance)))
 
 
-@compiled
+@entry_point
 def near_relevance(target, source, action, mapping, bandwidths, weight, evidence, values):
     """Compute ``equations.near_relevances``, as :func:`relevance`; ``evidence``: float64 scratch, shaped as ``values``."""
     n = source.size[action]
@@ -146,6 +146,3 @@ def _sift_down(heap, root, size):
         root = below
         below = 2 * root + 1
     heap[root] = entry
-
-
-_relevance, _near_relevance = EntryPoint(relevance), EntryPoint(near_relevance)

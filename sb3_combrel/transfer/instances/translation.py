@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint, compiled, inlined
+from sb3_combrel.common.compiled import entry_point, inlined
 from sb3_combrel.common.instances import BLOCK, Instances
 from sb3_combrel.common.kernels import list_room
 from sb3_combrel.common.periodic import difference
@@ -206,7 +206,7 @@ def write_row(s, own, kept, arrays, transferred):
             transferred.effect[s, n, v] = mappings.sign[row, v] * source.effect[action, j, k] if k >= 0 else 0.0
 
 
-@compiled
+@entry_point
 def translate(states, own, ranges, arrays, transferred):
     """Translate instances for n states and actions (see ``Transfer.transferred``).
 
@@ -226,9 +226,6 @@ def translate(states, own, ranges, arrays, transferred):
         for candidate in range(first[s], last[s]):
             kept = add_near_instances(states[s], own[s], candidate, arrays, kept)
         write_row(s, own[s], kept, arrays, transferred)
-
-
-_translate = EntryPoint(translate)
 
 
 class Translator:
@@ -293,11 +290,11 @@ class Translator:
         """Translate instances for states and actions, see :func:`translate`, in arrays that the next call uses again."""
         if len(own_weight) > len(self._transferred.length):
             self._make_room(2 * len(own_weight))
-        _translate.call(states, own_weight, ranges, self._plain_arrays, self._plain_transferred)
+        translate.call(states, own_weight, ranges, self._plain_arrays, self._plain_transferred)
         # The most relevant instances may be far and light: cut off, they would not reach the threshold together.
         while self.rules.by_relevance and self._arrays.scratch.full[0]:
             self._max_instances *= 2
             self._set_arrays(self._arrays._replace(scratch=self._make_scratch()))
             self._make_room(len(self._transferred.length))
-            _translate.call(states, own_weight, ranges, self._plain_arrays, self._plain_transferred)
+            translate.call(states, own_weight, ranges, self._plain_arrays, self._plain_transferred)
         return self._transferred

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_combrel.common.checks import check_count, check_finite, check_positive
-from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.sources.recipes import checked_source
 from sb3_combrel.transfer.base import TargetTask, Transfer
@@ -118,12 +117,6 @@ class MappingExperts(Transfer):
         self.experts: list[Expert] = []
         self._ended: list[Episode] = []
         self._playing: dict[int, Episode] = {}  # by number of the environment
-
-    def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
-        return TransferredInstances.empty(len(actions), states.shape[1])
-
-    def changed(self, known: np.ndarray) -> bool | np.ndarray:
-        return False
 
     def action(self, state: np.ndarray) -> int | None:
         playing = self._playing.get(self.environment)

@@ -189,19 +189,23 @@ class MappingTransfer(Transfer):
         return self._source_use
 
     def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
-        return self._source_use.transferred(states, actions, own_weight)
+        if self.use == "prior":
+            return super().transferred(states, actions, own_weight)
+        return self._instances.transferred(states, actions, own_weight)
 
     def transferred_to_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
-        return self._source_use.transferred_to_sample(points, actions, own_weight)
+        if self.use == "prior":
+            return super().transferred_to_sample(points, actions, own_weight)
+        return self._instances.transferred_to_sample(points, actions, own_weight)
 
     def prior(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions:
-        return self._source_use.predict(states, actions)
+        return self.source_prior.predict(states, actions)
 
     def prior_version(self) -> int:
-        return self._source_use.version
+        return self.source_prior.version
 
     def value_bound(self) -> np.ndarray | None:
-        return self._source_use.value_bound()
+        return self.source_prior.value_bound()
 
     def change_optimism(self, gamma: float, max_value: float) -> None:
         super().change_optimism(gamma, max_value)
@@ -209,7 +213,7 @@ class MappingTransfer(Transfer):
             self.source_prior.change_optimism(gamma, max_value)
 
     def changed(self, known: np.ndarray) -> bool | np.ndarray:
-        return self._source_use.changed(known)
+        return self.use == "instances" and self._instances.changed(known)
 
     def lowest_reward(self) -> float:
         return min(float(source.rewards.min()) for source in self.sources)
@@ -226,7 +230,7 @@ class MappingTransfer(Transfer):
         self._source_use.end_episode(truncated)
 
     def note_use(self, transferred: TransferredInstances) -> None:
-        self._source_use.note_use(transferred)
+        self._instances.note_use(transferred)
 
     def describe(self, candidate: int) -> str:
         """Return target action, source action and pairs of variables of a candidate as text."""

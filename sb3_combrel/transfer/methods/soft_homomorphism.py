@@ -9,7 +9,7 @@ import numpy as np
 
 from sb3_combrel.common.checks import check_boolean, check_count, check_positive
 from sb3_combrel.common.periodic import differences
-from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
+from sb3_combrel.common.transferred import PriorPredictions
 from sb3_combrel.sources.recipes import checked_source
 from sb3_combrel.transfer.base import TargetTask, Transfer
 from sb3_combrel.transfer.candidates import SourceLike, load_one_source, stacked_instances
@@ -107,12 +107,6 @@ class SoftHomomorphism(Transfer):
         self._n_observed = self._n_fits = self._version = self._last_changed = 0
         self._fit_due, self._seconds = float(FIRST_RENEWAL), 0.0
 
-    def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
-        return TransferredInstances.empty(len(actions), states.shape[1])
-
-    def changed(self, known: np.ndarray) -> bool:
-        return False
-
     def prior_version(self) -> int:
         return self._version
 
@@ -142,8 +136,6 @@ class SoftHomomorphism(Transfer):
             self._fit()
 
     def end_episode(self, truncated: bool) -> None:
-        if truncated and self._n_observed <= self.max_transitions:
-            self._transitions.note_time_limit()
         if self._evidence.has_changed():
             self._evidence.renew()
             self._version += 1

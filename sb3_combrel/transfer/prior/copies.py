@@ -8,7 +8,6 @@ from itertools import accumulate
 
 import numpy as np
 
-from sb3_combrel.common.compiled import EntryPoint
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.sources.source_instances import SourceInstances
@@ -20,9 +19,6 @@ from sb3_combrel.transfer.source_model import SourceModel
 
 # From so many pairs on the different states of each copy are predicted once.
 MANY = 256
-
-_add_transition, _add_used = EntryPoint(add_transition), EntryPoint(add_used)
-_predict_pairs, _join_many = EntryPoint(predict_pairs), EntryPoint(join_many)
 
 Predicted = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -76,13 +72,13 @@ class Copies:
 
     def measure(self, state: np.ndarray, action: int, effect: np.ndarray, sums: CopySums) -> None:
         """Add a target transition to the sums."""
-        _add_transition.call(self.model.plain, self._plain_table, (state, action, effect), tuple(sums), self._scratch)
+        add_transition.call(self.model.plain, self._plain_table, (state, action, effect), tuple(sums), self._scratch)
 
     def measure_used(self, uses: Uses, action: int, effect: np.ndarray, predicted: Predicted, sums: CopySums) -> None:
         """Add a target transition to the sums, for what makes up its action alone; ``predicted``: by :meth:`predict`."""
         effects, _, [weight] = predicted
         transition = action, effect, effects[0], float(weight)
-        _add_used.call(self._plain_table, tuple(uses), transition, tuple(sums), np.empty(len(effect)))
+        add_used.call(self._plain_table, tuple(uses), transition, tuple(sums), np.empty(len(effect)))
 
     def uses(self, copies: np.ndarray, actions: np.ndarray) -> Uses:
         """List what makes up each target action; ``copies`` and ``actions`` as of ``Choice``."""
@@ -107,10 +103,10 @@ class Copies:
             n_uses, k = len(uses.copy), self.model.n_variables
             row, done = np.arange(n_uses), np.empty(n_uses, dtype=np.bool_)
             scratch = np.empty(k), row, done, np.empty((n_uses, k)), np.empty((n_uses, 2))
-            _predict_pairs.call(self.model.plain, self._plain_table, tuple(uses), (states, actions), predicted, scratch)
+            predict_pairs.call(self.model.plain, self._plain_table, tuple(uses), (states, actions), predicted, scratch)
         else:
             found = self._predict_distinct(uses, states, actions)
-            _join_many.call(self._plain_table, tuple(uses), actions, found, predicted)
+            join_many.call(self._plain_table, tuple(uses), actions, found, predicted)
         return predicted
 
     def _predict_distinct(

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled, inlined
+from sb3_combrel.common.compiled import entry_point, inlined
 from sb3_combrel.transfer.source_model import predict_source, source_arrays
 
 
@@ -39,7 +39,7 @@ def see_state(table, copy, state, at):
             at[k] += table.share[copy, k] * (1.0 - state[v] if table.sign[copy, v] < 0.0 else state[v])
 
 
-@compiled
+@entry_point
 def predict_pairs(source, table, uses, pairs, predicted, scratch):
     """Predict target states and actions, ``pairs``, see :func:`join_copies`; the structures are plain tuples.
 
@@ -93,7 +93,7 @@ def join_copies(table, uses, action, i, row, effects, outcomes, predicted):
     weight[i] = least if n > 0 and uses.complete[action] else 0.0
 
 
-@compiled
+@entry_point
 def join_many(table, uses, actions, found, predicted):
     """:func:`join_copies` for many pairs.
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import compiled, inlined
+from sb3_combrel.common.compiled import entry_point, inlined
 from sb3_combrel.common.kernels import squared_distance
 from sb3_combrel.transfer.prior.copy_predictions import CopyTable, Uses, see_state
 from sb3_combrel.transfer.prior.evidence import SMALLEST_ERROR
@@ -65,7 +65,7 @@ def add_prediction(sums, at, effect, predicted, scale, weight):
     sums.gain[at] += weight / (1.0 + weight) * np.log((effect * effect + scale) / (error + scale))
 
 
-@compiled
+@entry_point
 def add_transition(source, table, transition, sums, scratch):
     """Add one target transition (state, action, effect) to the sums, for all copies and source actions; plain tuples.
 
@@ -96,7 +96,7 @@ def add_transition(source, table, transition, sums, scratch):
                     add_prediction(sums, (copy, action, u, v), effect[v], of_copy, scale[v], weight)
 
 
-@compiled
+@entry_point
 def add_used(table, uses, transition, sums, scale):
     """Add one target transition to the sums, for what makes up its action alone.
 

@@ -27,7 +27,7 @@ def best_ending(copies: Copies, sums: CopySums, choice: Choice, transitions: Rec
         return choice
     actions, _ = best_actions(copies, sums)
     foretold = {copy: _foretold(copies, copy, actions[copy], transitions) for copy in itertools.chain(*options)}
-    ended = transitions.ended[: transitions.n] == transitions.TERMINATED
+    ended = transitions.ended[: transitions.n]
 
     def evidence(chosen: tuple[int, ...]) -> float:
         return ends_evidence(ended, np.prod([foretold[copy] for copy in chosen], axis=0))

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from sb3_combrel.common.periodic import differences
-from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
+from sb3_combrel.common.transferred import PriorPredictions
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.outcome_evidence import TRANSITIONS_BEFORE_WARNING, RegionErrors, warn_of_error
 from sb3_combrel.transfer.prior.copies import MANY, Copies, Predicted
@@ -95,17 +95,6 @@ class SourcePrior:
         self._stored: dict[tuple[int, int, int], tuple[np.ndarray, np.ndarray, Predicted]] = {}
         if isinstance(choose, Choice):
             self._set_choice(choose)
-
-    def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
-        return TransferredInstances.empty(len(actions), self.task.n_variables)
-
-    transferred_to_sample = transferred
-
-    def changed(self, known: np.ndarray) -> bool:
-        return False
-
-    def note_use(self, transferred: TransferredInstances) -> None:
-        pass
 
     def predict(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions:
         if self.choice is None:
@@ -216,8 +205,6 @@ class SourcePrior:
 
     def end_episode(self, truncated: bool) -> None:
         version = self.version
-        if truncated and self.n_observed <= self.max_transitions:
-            self.transitions.note_time_limit()
         if self.evidence.has_changed():
             # An agent that a source has led astray for an episode is not to be led there again.
             self._renew_evidence()
