@@ -126,8 +126,9 @@ class ObservationScaler:
         self.went_beyond = True
         if self._fixed and not self._warned and np.abs(excess).max() > ROUNDING:
             self._warned = True
+            observation = observations.reshape(-1, self.scaling.n_variables)[np.abs(excess).max(axis=-1).argmax()]
             warn_user(
-                f"the observation {observations} is outside the bounds low={self.scaling.low}, high={self.scaling.high} "
+                f"the observation {observation} is outside the bounds low={self.scaling.low}, high={self.scaling.high} "
                 "and counts as the nearest state inside; if this happens often, pass wider bounds=(low, high)"
             )
 

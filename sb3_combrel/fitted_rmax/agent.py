@@ -72,7 +72,8 @@ class FittedRMaxAgent:
         self._method = NoTransfer() if transfer is None else transfer
         self.model_class = MODELS[settings.degree] if model_class is None else model_class
         self.rng = np.random.default_rng() if rng is None else rng
-        self._prediction_rng = self.rng.spawn(1)[0]
+        #: Of predictions that are drawn, which do not change what is learned.
+        self.prediction_rng = self.rng.spawn(1)[0]
         d = task.n_variables
         #: Which state variables are periodic.
         self.periodic = periodic_flags(settings.periodic, d)
@@ -150,8 +151,8 @@ class FittedRMaxAgent:
         :param state: unit coordinates, shape (n_variables,)
         :param explore: whether to choose for learning: greedily, ties broken at random, so that optimistic actions come
             first. Otherwise the best of the actions that are known, or else modelled with transferred instances; where a
-            source bounds the values, of all. Values are then those of what is known alone, if it has no source and all
-            variables have bounds, or if it has been given transitions and has made none itself.
+            source bounds the values, of all. Values are then those of what is known alone, if it has no source, and the grid
+            is not coarse or all variables have bounds; or if it has been given transitions and has made none itself.
         :param environment: in learning, the number of the environment, for a transfer method that decides actions
         :return: the action, from 0 on
         :raises ValueError: if a transfer method decides on something that is no action
@@ -220,6 +221,12 @@ class FittedRMaxAgent:
             self._take_in(state, action, reward, next_state, terminated)
             self._plan(SWEEPS_A_STEP)
             self._move_lines()
+
+    def break_off(self) -> None:
+        """Take in that all environments have been reset, wherever they were."""
+        with self.lock:
+            self.promises.stays.clear()
+            self._method.break_off()
 
     def end_episode(self, truncated: bool, environment: int = 0) -> None:
         """Plan on while no action is due.
@@ -352,7 +359,7 @@ class FittedRMaxAgent:
         """Choose an action as in learning, optimistic ones first, but for a prediction: it does not change what is learned."""
         with self.lock:
             self._evaluate(state)
-            return int(self._prediction_rng.choice(np.flatnonzero(self._q.q == self._q.q.max())))
+            return int(self.prediction_rng.choice(np.flatnonzero(self._q.q == self._q.q.max())))
 
     def q_values(self, state: np.ndarray, values: np.ndarray | None = None) -> np.ndarray:
         """Compute the action values at an exact state.
@@ -462,7 +469,7 @@ class FittedRMaxAgent:
         """Go on with the random numbers of ``rng``, in the transfer method as well; predictions with some derived from it."""
         # The generator itself stays the same, as the transfer method has it too.
         self.rng.bit_generator.state = rng.bit_generator.state
-        self._prediction_rng = rng.spawn(1)[0]
+        self.prediction_rng = rng.spawn(1)[0]
 
     def get_state(self) -> dict[str, np.ndarray]:
         """What has been learned, float64 arrays by name; only the number of rows of arrays with several axes ever changes."""

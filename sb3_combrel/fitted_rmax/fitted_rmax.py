@@ -206,6 +206,7 @@ class FittedRMax(PastData):
         self.instances = instances
         self._names: dict[str, Any] = {}
         self._generator_state: dict[str, Any] | None = None
+        self._prediction_state: dict[str, Any] | None = None
         if _init_setup_model:
             self._setup_model()
 
@@ -221,7 +222,7 @@ class FittedRMax(PastData):
             self._rng = np.random.default_rng(np.random.randint(2**31))
         self.set_random_seed(self.seed)
         if self._generator_state is not None:
-            self._rng.bit_generator.state, self._generator_state = self._generator_state, None
+            self._rng.bit_generator.state = self._generator_state
         self.policy = self.policy_class(  # type: ignore[assignment]
             self.observation_space,
             self.action_space,
@@ -230,6 +231,9 @@ class FittedRMax(PastData):
             **{name: getattr(self, name) for name in FittedRMaxSettings.names()},
             **{**self._names, **self.policy_kwargs},
         )
+        if self._generator_state is not None and self._prediction_state is not None:
+            self.agent.prediction_rng.bit_generator.state = self._prediction_state
+        self._generator_state = self._prediction_state = None
         self.policy = self.policy.to(self.device)
         # What the user gave was a description: results are on the method in use. ``save`` writes a description again.
         self.transfer = self.policy.transfer
@@ -303,11 +307,14 @@ class FittedRMax(PastData):
         if self.env is None:
             raise ValueError("there is no environment to learn from: call set_env(env) first, or load(..., env=env)")
         run_name = self._run_name() if tb_log_name is None else tb_log_name
+        begins_anew = reset_num_timesteps or self._last_obs is None
         total_timesteps, callback = self._setup_learn(total_timesteps, callback, reset_num_timesteps, run_name, progress_bar)
         callback.on_training_start(locals(), globals())
         callback.on_rollout_start()
         self._episode_rewards = [[] for _ in range(self.n_envs)]
         self._last_states = self.policy.note(np.asarray(self._last_obs))
+        if begins_anew:
+            self.agent.break_off()
         self.agent.prepare()
         try:
             while self.num_timesteps < total_timesteps:

@@ -13,12 +13,13 @@ EQUAL_RETURNS = 20
 
 
 class ProgressWatch:
-    """Looks at the episodes of learning, and warns once of each of four things.
+    """Looks at the episodes of learning, and warns once of each of five things.
 
     - A return above ``max_value``: then that is no upper bound, and exploration ends too soon.
     - Episodes that cost nothing: all rewards are 0, and gamma is 1 or ``max_value`` is 0. What is known then keeps the value
       ``max_value`` of what is unknown, and nothing draws the agent to the unknown.
     - Episodes that all end by their time limit, with gamma 1.
+    - Rewards none of which planning tells from 0.
     - Returns that are all exactly alike, at the time limit, while actions are still tried for the first time or nothing has
       told states apart: nothing that exploration reaches makes a difference.
     """
@@ -27,6 +28,7 @@ class ProgressWatch:
         self.rewards, self.tolerance = rewards, float(tolerance)
         self._n_idle = self._n_equal = self._n_optimistic = 0
         self._last_return: float | None = None
+        self._largest = 0.0
         self._warned: set[str] = set()
 
     def note(self, rewards: Sequence[float], terminated: bool, n_optimistic_actions: int) -> None:
@@ -40,6 +42,7 @@ class ProgressWatch:
             self._note_best_return(rewards)
         self._note_cost(rewards, terminated)
         self._note_endless()
+        self._note_size(rewards)
         explored, self._n_optimistic = n_optimistic_actions > self._n_optimistic, n_optimistic_actions
         self._note_return(rewards, terminated, explored)
 
@@ -80,6 +83,15 @@ class ProgressWatch:
                 "endless",
                 f"gamma=1, and all {seen.n_truncated} episodes have ended by their time limit: if the task has no end, "
                 "returns grow without limit, and plans never settle; leave gamma out, or pass gamma=0.99",
+            )
+
+    def _note_size(self, rewards: Sequence[float]) -> None:
+        self._largest = max(self._largest, *map(abs, rewards))
+        if 0.0 < self._largest <= self.tolerance:
+            self._warn(
+                "tiny",
+                f"no reward is larger than {self._largest:g}, and plans are good to planning_tolerance={self.tolerance:g}: "
+                f"pass planning_tolerance={self.tolerance * self._largest:.2g}, or larger rewards",
             )
 
     def _note_return(self, rewards: Sequence[float], terminated: bool, explored: bool) -> None:

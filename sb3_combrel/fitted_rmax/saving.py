@@ -48,6 +48,7 @@ class SavedAlgorithm(BaseAlgorithm):
     transfer: Any
     _rng: np.random.Generator
     _generator_state: dict[str, Any] | None
+    _prediction_state: dict[str, Any] | None
     #: Version of this package that has saved the model.
     package_version: str
 
@@ -75,6 +76,7 @@ class SavedAlgorithm(BaseAlgorithm):
         written.transfer = describe_transfer(self.policy.transfer)
         written.package_version = __version__
         written._generator_state = dict(self._rng.bit_generator.state)
+        written._prediction_state = dict(self.policy.agent.prediction_rng.bit_generator.state)
         super(SavedAlgorithm, written).save(archive, exclude, include)
         content = _zipped_anew(archive, zipfile.ZIP_DEFLATED).getvalue()
         if isinstance(path, str | Path):
@@ -103,7 +105,7 @@ class SavedAlgorithm(BaseAlgorithm):
         :param print_system_info: whether to print system info from the saved model and the current system info
         :param force_reset: force a call to ``reset()`` before training
         :param kwargs: arguments of the constructor to change; ``transfer=`` where a transfer method could not be saved;
-            ``instances=`` for more past data. Without ``seed=`` the random number generator continues from its saved state.
+            ``instances=`` for more past data. Without ``seed=`` the random number generators continue from their saved states.
         :return: new model instance with loaded parameters
         :raises FileNotFoundError: if there is no such file
         :raises ValueError: if the file is damaged, was not saved by this class, or does not fit the other arguments

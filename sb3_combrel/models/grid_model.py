@@ -169,9 +169,9 @@ class GridModel(Model):
             return due
         self._renew_ends()
         # What is known of ends concerns all actions that may lead there.
-        arrived, noted = self.arrivals.state[action, slot], [due.copy()]
+        arrived, noted = self.arrivals.state[action, slot], [due]
         widest = (self._cell + float(np.linalg.norm(self.instances.effect[action, slot]))) ** 2
-        noted += [self._note((arrived, numbers, size), other, widest, ENDED).copy() for other in range(self.n_actions)]
+        noted += [self._note((arrived, numbers, size), other, widest, ENDED) for other in range(self.n_actions)]
         return np.unique(np.concatenate(noted))
 
     def _inform(self, reward: float, terminated: bool, due: np.ndarray) -> np.ndarray:
@@ -194,7 +194,8 @@ class GridModel(Model):
         """Note at the pairs of an action what has happened near them; those that are to be fitted."""
         first = action * self.grid.n_points
         n = note_instance.call(instance, first, self._plain_pairs, widest, why, self.grid.plain, self._rules, self._points)
-        due: np.ndarray = self._points[2][:n]
+        # The next transition writes to the same work space, and an interrupt may leave these pairs to be fitted after it.
+        due: np.ndarray = self._points[2][:n].copy()
         return due
 
     def _slot_for(self, state: np.ndarray, action: int) -> tuple[int, np.ndarray]:
@@ -204,8 +205,9 @@ class GridModel(Model):
             apart = differences(instances.state[action, :size], state, instances.periodic)
             slot = int((apart**2).sum(axis=1).argmin())
             numbers = self._numbers_of(action, slot)
+            self._sizes[action] = np.maximum(self._sizes[action] - np.abs(numbers), 0.0)
             instance = instances.state[action, slot], numbers, numbers
-            removed = self._note(instance, action, self.kernel.reach, WENT).copy()
+            removed = self._note(instance, action, self.kernel.reach, WENT)
             if instances.terminated[action, slot]:
                 instances.terminated[action, slot] = False
                 self._renew_ends()

@@ -144,6 +144,9 @@ class Transfer(ABC):
     def end_episode(self, truncated: bool) -> None:  # noqa: B027 - a method may well ignore it
         """Take in the end of an episode; ``truncated``: by its time limit, not in a terminal state."""
 
+    def break_off(self) -> None:  # noqa: B027 - a method may well ignore it
+        """Take in that all environments have been reset, and that the episodes that went on are none."""
+
     def changed(self, known: np.ndarray) -> bool | np.ndarray:
         """Say where the instances may differ from those returned before; called after each transition and each episode.
 

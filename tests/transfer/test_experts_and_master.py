@@ -199,7 +199,7 @@ def test_an_episode_that_was_broken_off_counts_for_nothing():
     state = np.full(2, 0.5)
     assert method.action(state) is not None
     method.observe(state, 0, -1.0, np.array([0.6, 0.5]), False)
-    # Somewhere else: the environment has been reset.
+    method.break_off()
     assert method.action(np.array([0.2, 0.5])) is not None
     method.observe(np.array([0.2, 0.5]), 0, -5.0, np.array([0.3, 0.5]), True)
     method.end_episode(False)

@@ -35,7 +35,7 @@ class Episode:
     total: float = 0.0
     steps: int = 0
     acted: int = 0
-    state: np.ndarray | None = None  # reached last, unit coordinates; None before the first step
+    asked: bool = False  # for an action, whose transition has not come yet: others are past data
 
 
 @dataclass(repr=False, eq=False)
@@ -102,7 +102,11 @@ class MappingExperts(Transfer):
             raise ValueError(f"mappings must be a set of mappings, one an expert, no factored ones, got {self.mappings!r}")
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
+        again = self.task is not None and self.rng is rng
         super().bind(task, rng)
+        if again:
+            # The same agent in other unit coordinates: neither experts nor returns depend on them.
+            return
         self.source, self.mappings = loaded(self.source, self.mappings, task)
         self.sources = load_sources(self.source)
         self._sets = resolved_sets(self.sources, self.mappings, task)
@@ -117,15 +121,13 @@ class MappingExperts(Transfer):
         self.experts: list[Expert] = []
         self._ended: list[Episode] = []
         self._playing: dict[int, Episode] = {}  # by number of the environment
+        self._own = False  # whether the last transition was of an episode of its own
 
     def action(self, state: np.ndarray) -> int | None:
         playing = self._playing.get(self.environment)
-        if playing is not None and playing.state is not None and not np.array_equal(playing.state, state):
-            # An episode that was broken off, by a reset at the start of ``learn``, counts for nothing.
-            del self._playing[self.environment]
-            playing = None
         if playing is None:
             playing = self._playing[self.environment] = Episode(self._choose())
+        playing.asked = True
         if playing.arm == AGENT or playing.acted >= self._most_steps():
             return None
         action = self.expert_action(playing.arm, state)
@@ -171,15 +173,18 @@ class MappingExperts(Transfer):
 
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         playing = self._playing.get(self.environment)
-        if playing is not None:
+        self._own = playing is not None and playing.asked
+        if playing is not None and self._own:
+            playing.asked = False
             playing.total += reward
             playing.steps += 1
-            playing.state = next_state.copy()
 
     def end_episode(self, truncated: bool) -> None:
-        playing = self._playing.pop(self.environment, None)
-        if playing is not None:
-            self._ended.append(playing)
+        if self._own and self.environment in self._playing:
+            self._ended.append(self._playing.pop(self.environment))
+
+    def break_off(self) -> None:
+        self._playing.clear()
 
     def mean_returns(self) -> np.ndarray:
         """Return the mean return of the agent, of the later half of its episodes, and of each expert; NaN before the first."""
@@ -221,20 +226,20 @@ class MappingExperts(Transfer):
 
     def get_state(self) -> dict[str, np.ndarray]:
         episodes = [(each.arm, each.total, each.steps, each.acted) for each in self._ended]
-        going = [(number, one, one.state) for number, one in self._playing.items() if one.state is not None]
-        playing = [(number, one.arm, one.total, one.steps, one.acted, *state) for number, one, state in going]
+        playing = [(number, one.arm, one.total, one.steps, one.acted) for number, one in self._playing.items()]
         return {
             "experts": self._numbers[:, None].astype(np.float64),
             "episodes": np.array(episodes, dtype=np.float64).reshape(-1, 4),
-            "playing": np.array(playing, dtype=np.float64).reshape(-1, 5 + self._bound_task.n_variables),
+            "playing": np.array(playing, dtype=np.float64).reshape(-1, 5),
         }
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         self._set_experts(state["experts"][:, 0].astype(np.int64))
+        self._ended, self._playing = [], {}
         for arm, total, steps, acted in state["episodes"].tolist():
             self._ended.append(Episode(int(arm), total, int(steps), int(acted)))
-        for environment, arm, total, steps, acted, *reached in state["playing"].tolist():
-            self._playing[int(environment)] = Episode(int(arm), total, int(steps), int(acted), np.array(reached))
+        for environment, arm, total, steps, acted in state["playing"].tolist():
+            self._playing[int(environment)] = Episode(int(arm), total, int(steps), int(acted))
 
 
 def mean_return(arm: int, returns: list[float]) -> float:

@@ -230,7 +230,8 @@ class MappingTransfer(Transfer):
         self._source_use.end_episode(truncated)
 
     def note_use(self, transferred: TransferredInstances) -> None:
-        self._instances.note_use(transferred)
+        if self.use == "instances":
+            self._instances.note_use(transferred)
 
     def describe(self, candidate: int) -> str:
         """Return target action, source action and pairs of variables of a candidate as text."""

@@ -76,7 +76,13 @@ class TIMBREL(MappingTransfer):
         return given if isinstance(self.mapping, str) else {name: each for name, each in given.items() if name != "mappings"}
 
     def bind(self, task: TargetTask, rng: np.random.Generator) -> None:
+        drawn = None
+        if self.task is not None and self.rng is rng and self.use == "prior" and isinstance(self.mapping, str):
+            # The same agent in other unit coordinates: what was drawn for the whole run stays.
+            drawn = self.source_prior.choice
         super().bind(task, rng)
+        if drawn is not None:
+            self.source_prior.set_choice(drawn)
         if not isinstance(self.mapping, str):
             # With numbers in place of names.
             self.mapping = self.mappings  # type: ignore[assignment]

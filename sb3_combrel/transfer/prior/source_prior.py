@@ -94,7 +94,7 @@ class SourcePrior:
         self.choice: Choice | None = None
         self._stored: dict[tuple[int, int, int], tuple[np.ndarray, np.ndarray, Predicted]] = {}
         if isinstance(choose, Choice):
-            self._set_choice(choose)
+            self.set_choice(choose)
 
     def predict(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions:
         if self.choice is None:
@@ -224,7 +224,7 @@ class SourcePrior:
             choice = self.choose(self.sums)
             if not choice.same(self.choice):
                 self.n_switches += self.choice is not None
-                self._set_choice(choice)
+                self.set_choice(choice)
                 self._replay()
                 self.version += 1
         self._renew_bounding()
@@ -248,7 +248,8 @@ class SourcePrior:
             self.bounding, self.excess, self.version = bounding, 0.0, self.version + 1
             self.explains = self._explains()
 
-    def _set_choice(self, choice: Choice) -> None:
+    def set_choice(self, choice: Choice) -> None:
+        """Predict through these copies from now on."""
         self.choice, self.bounding = choice, whole_part(self.copies, choice)
         self._used = self.copies.uses(*choice)
         self._stored.clear()
@@ -361,7 +362,7 @@ class SourcePrior:
         chosen = state["prior_choice"].reshape(5, n_actions, d).astype(np.int64)
         if chosen[0].min() >= 0:
             choice, bounding = self._restored(chosen[1:3, :, : int(n_slots)]), self._restored(chosen[3:])
-            self._set_choice(choice)
+            self.set_choice(choice)
             self.bounding = whole_part(self.copies, bounding)
         self.n_observed, self.n_switches, self.version = int(observed), int(switches), int(version)
         self._renewal_due, self._warned, self.explains = due, warned > 0.5, explains > 0.5

@@ -1,0 +1,158 @@
+"""Nothing is taken for something else: after a reset, an interrupt, other scales, in several environments."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from helpers.agents import make_agent
+from helpers.walk import Walk, small, walk_source
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_combrel import COMBREL, TIMBREL, FittedRMax, SourceInstances
+from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
+from sb3_combrel.transfer.methods.experts import MappingExperts
+
+CART = "CartPole-v1"  # without bounds: unit coordinates change as the agent sees more
+
+
+class Note(BaseCallback):
+    """Keeps what ``read`` says of the transfer method after every step."""
+
+    def __init__(self, read):
+        super().__init__()
+        self.read, self.found = read, []
+
+    def _on_step(self):
+        self.found.append(self.read(self.model.transfer))
+        return True
+
+
+@pytest.fixture
+def rescaled(monkeypatch):
+    """How often unit coordinates were changed."""
+    times, before = [], FittedRMaxAgent._rescale
+    monkeypatch.setattr(FittedRMaxAgent, "_rescale", lambda self, *given: (times.append(1), before(self, *given))[1])
+    return times
+
+
+def test_a_random_mapping_is_drawn_once_for_the_whole_run(rescaled):
+    source = SourceInstances.record(None, CART, 300, seed=0)
+    method = TIMBREL(source, "random", mappings="signed_injective", use="prior")
+    models = [FittedRMax(CART, transfer=method, seed=seed) for seed in (0, 1)]
+    first = [model.transfer.describe_prior() for model in models]
+    notes = [Note(lambda transfer: transfer.describe_prior()) for _ in models]
+    for model, note in zip(models, notes, strict=True):
+        model.learn(150, callback=note)
+    assert len(rescaled) > 6 and first[0] != first[1]
+    assert [set(note.found) for note in notes] == [{first[0]}, {first[1]}]
+
+
+def test_experts_and_their_returns_stay_when_unit_coordinates_change(rescaled):
+    source = SourceInstances.record(None, CART, 300, seed=0)
+    returns = Note(lambda transfer: (list(transfer._numbers), [each.total for each in transfer._ended]))
+    model = FittedRMax(CART, transfer=MappingExperts(source, max_experts=3), seed=0).learn(400, callback=returns)
+    assert len(rescaled) > 6
+    assert len({str(numbers) for numbers, _ in returns.found}) == 1
+    made = [info["r"] for info in model.ep_info_buffer]
+    assert returns.found[-1][1] == made[: len(returns.found[-1][1])] and len(made) - len(returns.found[-1][1]) <= 1
+
+
+def test_past_data_are_no_return_of_the_expert_that_acts():
+    walk = gym.wrappers.TimeLimit(Walk(limit=1000), 30)
+    model = FittedRMax(walk, transfer=MappingExperts(walk_source(), max_experts=2), seed=0).learn(75)
+    before = [(each.arm, each.total) for each in model.transfer._all_episodes()]
+    model.load_instances(walk_source(100))
+    assert [(each.arm, each.total) for each in model.transfer._all_episodes()] == before
+    model.learn(60, reset_num_timesteps=False)
+    assert {each.total for each in model.transfer._ended} <= {info["r"] for info in model.ep_info_buffer}
+
+
+class Ending(gym.Env):
+    """Each step leads on; an episode ends, or is cut, after ``n`` of them."""
+
+    observation_space, action_space = gym.spaces.Box(0.0, 1.0, (1,)), gym.spaces.Discrete(2)
+
+    def __init__(self, n, terminates):
+        self.n, self.terminates = n, terminates
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.k = 0
+        return np.float32([0.0]), {}
+
+    def step(self, action):
+        self.k += 1
+        over = self.k == self.n
+        return np.float32([self.k / self.n]), -1.0, over and self.terminates, over and not self.terminates, {}
+
+
+def test_a_time_limit_of_one_environment_is_no_end_of_another():
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    source = SourceInstances.record(None, Ending(5, True), 60, seed=0)
+    envs = DummyVecEnv([lambda: Ending(5, True), lambda: Ending(5, False)])
+    model = FittedRMax(envs, transfer=COMBREL(source), seed=0).learn(40)
+    seen = model.transfer.source_prior.transitions
+    assert seen.ended[: seen.n].sum() == model.source_instances().terminated.sum() == 4
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_sizes_are_those_of_the_instances_that_are_kept(degree):
+    agent = make_agent(1, 1, max_instances=10, degree=degree)
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        state = rng.random(1)
+        agent.update(state, 0, float(rng.normal()), np.clip(state + 0.1 * rng.normal(size=1), 0.0, 1.0), False)
+    model = agent.model
+    kept = model.instances.effect[0, :10], model.instances.reward[0, :10]
+    np.testing.assert_allclose(model._sizes[0], [np.abs(kept[0]).sum(), np.abs(kept[1]).sum()], atol=1e-9)
+
+
+def test_an_interrupt_loses_no_pair_that_is_due(monkeypatch):
+    model = small(degree=1).learn(60)
+    agent, due = model.agent, []
+
+    def interrupted(pairs):
+        due.extend(pairs.tolist())
+        raise KeyboardInterrupt
+
+    state = np.array([0.5, 0.5])
+    with monkeypatch.context() as patched:
+        patched.setattr(agent.model, "update_all", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            agent.update(state, 0, -1.0, state + 0.01, False)
+    asked, fits = [], agent.model.update_all
+    monkeypatch.setattr(agent.model, "update_all", lambda pairs: (asked.extend(pairs.tolist()), fits(pairs)))
+    agent.update(state + 0.3, 1, -1.0, state + 0.31, False)
+    assert due and set(due) <= set(asked)
+
+
+def test_a_stay_ends_with_the_episode_that_a_new_call_of_learn_breaks_off():
+    model = FittedRMax(Ending(10**6, True), seed=0, bounds=(0.0, 1.0))
+    for _ in range(3):
+        model.learn(10)
+        [stay] = model.agent.promises.stays.values()
+        assert stay.n_steps == 10
+    model.learn(10, reset_num_timesteps=False)
+    [stay] = model.agent.promises.stays.values()
+    assert stay.n_steps == 20
+
+
+@pytest.mark.parametrize("seed", [0, None])
+def test_drawn_predictions_go_on_after_loading_as_they_would_have(tmp_path, seed):
+    model = small(seed=seed)
+    state = np.array([0.2, 1.0], dtype=np.float32)
+    model.predict(state, deterministic=False)
+    model.save(tmp_path / "walk")
+    loaded = [FittedRMax.load(tmp_path / "walk") for _ in range(2)]
+    drawn = [[int(each.predict(state, deterministic=False)[0]) for _ in range(20)] for each in (model, *loaded)]
+    assert drawn[0] == drawn[1] == drawn[2] and len(set(drawn[0])) == 2
+
+
+def test_rewards_too_small_for_the_plan_are_named():
+    class Tiny(Walk):
+        def step(self, action):
+            state, reward, terminated, truncated, info = super().step(action)
+            return state, 1e-5 * reward, terminated, truncated, info
+
+    with pytest.warns(UserWarning, match=r"no reward is larger than 1e-05.*pass planning_tolerance=1e-08"):
+        small(Tiny()).learn(40)
