@@ -24,6 +24,7 @@ from sb3_combrel.common.observations import with_own_arrays
 from sb3_combrel.common.serialisation import to_plain
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.fitted_rmax.arguments import DEFAULT_POLICY, MAX_SEED, check_actions, check_policy, check_type, policy_and_env
+from sb3_combrel.fitted_rmax.ends_check import EndsCheck
 from sb3_combrel.fitted_rmax.past_data import PastData
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 from sb3_combrel.fitted_rmax.progress import ProgressWatch
@@ -241,6 +242,7 @@ class FittedRMax(PastData):
         #: Unit coordinates of the last observations while it learns, shape (n_envs, n_variables).
         self._last_states: np.ndarray | None = None
         self._progress = ProgressWatch(self.agent.rewards, self.planning_tolerance)
+        self._ends_check = EndsCheck(self.agent.periodic)
         # They are saved with what was learned from them.
         given, self.instances = self.instances, None
         if given is not None:
@@ -325,6 +327,8 @@ class FittedRMax(PastData):
             self._last_states = None
             callback.on_training_end()
         self.policy.to_unit.warn_of_share(self.policy.scales.observed, self.agent.task.state_names)
+        if self.degree == 1 and self.agent.rewards.n_ended > 0:
+            self._ends_check.look(self.agent.model.transitions())
         return self
 
     def _refuse_changes(self) -> None:

@@ -69,8 +69,8 @@ def test_it_is_the_return_that_is_best_in_the_source(gamma, sign):
     found = value_bound([line_source()], target, [[-1, 0]], [[1, sign]]).through(all_of(0))
     x = target.sample_states[:, 1]
     expected = best_return(x if sign > 0 else 1.0 - x, gamma)
-    # Where a step is rounded up, and the border of where episodes end is blurred, by a step.
-    np.testing.assert_allclose(found, expected, atol=1.6)
+    # No less, as it is a bound; and by less than a step more, as a step is rounded up, and the border of ends is blurred.
+    assert (found > expected - 0.1).all() and (found < expected + 1.0).all()
     assert np.corrcoef(found, expected)[0, 1] > 0.99
 
 
@@ -101,7 +101,8 @@ def test_of_several_copies_the_one_that_is_worth_least_bounds_the_target():
     of_two = value_bound([line_source(), line_source(goal=0.6)], target, [[0, -1], [-1, 0]], source=[0, 1])
     found, one, two = (of_two.through(all_of(*copies)) for copies in ((0, 1), (0,), (1,)))
     np.testing.assert_array_equal(found, np.minimum(one, two))
-    np.testing.assert_allclose(two, best_return(target.sample_states[:, 1], goal=0.6), atol=1.6)
+    expected = best_return(target.sample_states[:, 1], goal=0.6)
+    assert (two > expected - 0.1).all() and (two < expected + 1.0).all()
     assert (found < one).any() and (found < two).any()
 
 
