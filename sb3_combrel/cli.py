@@ -8,6 +8,8 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from sb3_combrel.common.version import __version__
+
 NEEDS_EXTRA = "this needs {missing}, which is not installed: pip install 'sb3-combrel[experiments]'"
 OF_EXTRA = ("combrel_envs", "matplotlib", "mujoco", "dm_control", "moviepy", "tyro")
 
@@ -179,6 +181,9 @@ def main(args: Sequence[str] | None = None) -> int:
     :param args: arguments, those of the process by default
     :return: exit status: 0, or 1 if something was wrong with the arguments or a run failed, or 130 if the user stopped it
     """
+    if list(sys.argv[1:] if args is None else args) == ["--version"]:
+        print(f"sb3-combrel {__version__}")
+        return 0
     try:
         import tyro
     except ModuleNotFoundError:

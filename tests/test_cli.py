@@ -7,6 +7,7 @@ from helpers.command_line import call_for_all_output
 
 import combrel_envs  # noqa: F401 - registers the tasks
 from sb3_combrel import SourceInstances
+from sb3_combrel.common.version import __version__
 
 
 class TestRecord:
@@ -48,6 +49,9 @@ class TestCommandLine:
         status, written = call_for_all_output("--help")
         assert status == 0 and all(name in written for name in ("demo", "record", "reproduce", "benchmark"))
         assert call_for_all_output("dance")[0] == 2
+
+    def test_it_says_its_version(self):
+        assert call_for_all_output("--version") == (0, f"sb3-combrel {__version__}\n")
 
     def test_without_tyro_the_command_names_what_to_install(self, monkeypatch):
         monkeypatch.setitem(sys.modules, "tyro", None)

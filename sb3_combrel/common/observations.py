@@ -122,7 +122,7 @@ class ObservationScaler:
     def _check_outside(self, observations: np.ndarray, excess: np.ndarray) -> None:
         """Refuse what is not finite, warn once of what is outside the bounds by more than rounding."""
         if not np.isfinite(excess).all():
-            raise ValueError(f"the environment returned an observation that is not finite: {observations}")
+            raise ValueError(f"an observation must be finite, got {observations}")
         self.went_beyond = True
         if self._fixed and not self._warned and np.abs(excess).max() > ROUNDING:
             self._warned = True

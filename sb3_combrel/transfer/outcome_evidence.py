@@ -49,8 +49,20 @@ class OutcomeEvidence:
         self.tolerance = 0.5 * float(rewards.std()) + 0.1 * float(np.abs(rewards).mean()) + 1e-9
         # Unpredicted: ends; absent: visits to where an end is predicted that have left without one, or lasted for long.
         self.confirmed = self.unpredicted = self.absent = 0
-        self.rewards_right = self.rewards_wrong = self.steps_of_visit = 0
+        self.rewards_right = self.rewards_wrong = 0
+        #: Number of the environment that the next transition is from; and the steps of its visit, by environment.
+        self.environment = 0
+        self._visits: dict[int, int] = {}
         self.reward_range = (np.inf, -np.inf)
+
+    @property
+    def steps_of_visit(self) -> int:
+        """How long the environment has been where an end is predicted."""
+        return self._visits.get(self.environment, 0)
+
+    @steps_of_visit.setter
+    def steps_of_visit(self, steps: int) -> None:
+        self._visits[self.environment] = steps
 
     def note(self, predicted: tuple[float, float] | None, reward: float, terminated: bool) -> None:
         """Take in a transition; ``predicted``: probability of termination, and reward; None where the source has no data."""
@@ -86,7 +98,7 @@ class OutcomeEvidence:
         return self.unpredicted + self.absent
 
     def get_state(self) -> np.ndarray:
-        """What was counted, float64, shape (8,)."""
+        """What was counted, float64, shape (8,); of several environments the visit of the last one."""
         counts = [getattr(self, name) for name in COUNTS]
         return np.array([*counts, *np.clip(self.reward_range, -1e300, 1e300)], dtype=np.float64)
 

@@ -67,3 +67,16 @@ def test_counts_are_saved():
         note(each, [SURE, NONE])
         each.end_episode(True)
     assert vars(made) == vars(other)
+
+
+def test_visits_are_those_of_each_environment():
+    """Twenty steps where an end is predicted, of one environment; another is where none is, and ends there."""
+    evidence = OutcomeEvidence(np.full(10, -1.0))
+    for _ in range(2 * STEPS_OF_A_VISIT):
+        evidence.environment = 0
+        evidence.note((1.0, -1.0), -1.0, False)
+        evidence.environment = 1
+        evidence.note((0.0, -1.0), -1.0, False)
+    assert evidence.absent == 2
+    evidence.note((0.0, -1.0), -1.0, True)
+    assert (evidence.unpredicted, evidence.confirmed) == (1, 0)

@@ -35,7 +35,7 @@ class InstanceTransfer:
         self.task = task = selector.task
         self.candidates = selector.candidates
         self.sources = selector.candidates.sources
-        #: Number of the environment that transitions come from, which makes no difference.
+        #: Number of the environment that transitions come from.
         self.environment = 0
         #: Transitions of the target that were observed.
         self.n_observed = 0
@@ -80,6 +80,7 @@ class InstanceTransfer:
     def observe(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool) -> None:
         """Take in a transition of the target; ``effect``: next state minus state, unit coordinates, shape (n_variables,)."""
         self.n_observed += 1
+        self.check.evidence.environment = self.environment
         predicted = self.check.observe(state, action, reward, effect, terminated)
         if predicted is not None:
             self.errors.note(state, action, effect, predicted)
@@ -93,6 +94,7 @@ class InstanceTransfer:
 
     def end_episode(self, truncated: bool) -> None:
         """Narrow the kernel if the target has contradicted what was transferred: else nothing would ever be explored."""
+        self.check.evidence.environment = self.environment
         if self.check.end_episode(truncated) and self.breadth_decay < 1.0:
             self.translator.set_breadth(self.translator.rules.breadth * self.breadth_decay)
             self.all_changed = True
