@@ -76,6 +76,10 @@ class Transfer(ABC):
         """
         if self.use not in USES:
             raise ValueError(f"{type(self).__name__}.use must be one of {', '.join(USES)}, got {self.use!r}")
+        if self.use == "instances" and type(self).transferred is Transfer.transferred:
+            raise ValueError(
+                f'{type(self).__name__} has use="instances", but no method transferred(states, actions, own_weight)'
+            )
         self.task = task
         self.rng = rng
 
@@ -87,10 +91,7 @@ class Transfer(ABC):
         :param own_weight: sum of the kernel weights of the target's own instances there, shape (n,)
         :return: for each pair instances whose weights and ``own_weight`` together reach ``task.exploration_threshold``, or
             none, which leaves it optimistic; good until the next call
-        :raises NotImplementedError: if :attr:`use` is "instances", and the method has none
         """
-        if self.use == "instances":
-            raise NotImplementedError(f"{type(self).__name__} has no method transferred(states, actions, own_weight)")
         return TransferredInstances.empty(len(actions), states.shape[1])
 
     def transferred_to_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:

@@ -373,3 +373,17 @@ def test_whatever_is_no_action_is_refused(what):
     agent = make_agent(1, 3, Deciding(what, every=1))
     with pytest.raises(ValueError, match=r"Deciding\.action must return None or a whole number from 0 to 2, got"):
         agent.act(np.array([0.5]))
+
+
+def test_a_method_of_instances_must_have_some():
+    class Silent(Transfer):
+        def observe(self, state, action, reward, next_state, terminated):
+            pass
+
+    with pytest.raises(ValueError, match=r'Silent has use="instances", but no method transferred'):
+        small(transfer=Silent())
+
+    class Acting(Silent):
+        use = "actions"
+
+    assert small(transfer=Acting()).learn(20).agent.model.n_instances == 20

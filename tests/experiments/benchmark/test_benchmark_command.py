@@ -261,7 +261,7 @@ class TestBadInput:
             (("--methods", "no_such_module:M"), "methods: no_such_module cannot be imported: ModuleNotFoundError"),
             (("--methods", "failing.py:Gone"), "methods: failing.py defines no Gone"),
             (("--methods", "failing.py:NUMBER"), "methods: failing.py:NUMBER must be a Method, .* got 3"),
-            (("--methods", "failing.py:NoMethod"), "methods: failing.py:NoMethod lacks observe, transferred"),
+            (("--methods", "failing.py:NoMethod"), "methods: failing.py:NoMethod lacks observe"),
             (("--pairs", "failing.py"), "pairs: failing.py defines no PAIR"),
             (("--pairs", "raising.py"), "pairs: raising.py cannot be imported: FileNotFoundError: .*table.csv"),
             (("--methods", "none", "none"), "methods must be .* different names, got none, none"),
