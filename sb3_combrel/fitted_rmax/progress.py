@@ -28,7 +28,7 @@ class ProgressWatch:
         self.rewards, self.tolerance = rewards, float(tolerance)
         self._n_idle = self._n_equal = self._n_optimistic = 0
         self._last_return: float | None = None
-        self._largest = 0.0
+        self._largest, self._n_episodes = 0.0, 0
         self._warned: set[str] = set()
 
     def note(self, rewards: Sequence[float], terminated: bool, n_optimistic_actions: int) -> None:
@@ -87,11 +87,12 @@ class ProgressWatch:
 
     def _note_size(self, rewards: Sequence[float]) -> None:
         self._largest = max(self._largest, *map(abs, rewards))
-        if 0.0 < self._largest <= self.tolerance:
+        self._n_episodes += 1
+        if self._n_episodes == EQUAL_RETURNS and 0.0 < self._largest <= self.tolerance:
             self._warn(
                 "tiny",
-                f"no reward is larger than {self._largest:g}, and plans are good to planning_tolerance={self.tolerance:g}: "
-                f"pass planning_tolerance={self.tolerance * self._largest:.2g}, or larger rewards",
+                f"no reward so far is larger than {self._largest:g}, and plans are good to planning_tolerance="
+                f"{self.tolerance:g}: pass planning_tolerance={self.tolerance * self._largest:.2g}, or larger rewards",
             )
 
     def _note_return(self, rewards: Sequence[float], terminated: bool, explored: bool) -> None:

@@ -154,5 +154,5 @@ def test_rewards_too_small_for_the_plan_are_named():
             state, reward, terminated, truncated, info = super().step(action)
             return state, 1e-5 * reward, terminated, truncated, info
 
-    with pytest.warns(UserWarning, match=r"no reward is larger than 1e-05.*pass planning_tolerance=1e-08"):
-        small(Tiny()).learn(40)
+    with pytest.warns(UserWarning, match=r"no reward so far is larger than 1e-05.*pass planning_tolerance=1e-08"):
+        small(Tiny(limit=10)).learn(200)
