@@ -233,7 +233,7 @@ def test_what_is_not_periodic_is_moved_to_the_boundary_with_a_warning_and_what_i
     with pytest.warns(UserWarning, match="outside the bounds"):
         np.testing.assert_allclose(scale(np.array([[1.5 * np.pi, 9.0]])), [[0.25, 1.0]])
     for wrong in (np.nan, np.inf, -np.inf):
-        with pytest.raises(ValueError, match="not finite"):
+        with pytest.raises(ValueError, match="an observation must be finite, got"):
             scale(np.array([wrong, 0.0]))
 
 
