@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from sb3_combrel.common.periodic import differences
 from sb3_combrel.common.user_warnings import warn_user
+from sb3_combrel.models.base import Model
 
 # So many ends are looked at; their arrivals and outcomes tell something if the one is by so much better than the other.
 ENOUGH, BETTER = 10, 0.25
@@ -35,12 +35,12 @@ class EndsCheck:
         self._warned: set[str] = set()
         self._due = 1.0
 
-    def look(self, transitions: list[tuple[np.ndarray, int, float, np.ndarray, bool]]) -> None:
-        """Look at all experience: state, action, reward, next state, terminated of each transition, unit coordinates."""
-        if len(transitions) < self._due:
+    def look(self, model: Model) -> None:
+        """Look at all experience of a model, unless it looked at most of it before."""
+        if model.n_instances < self._due:
             return
-        self._due = 1.5 * len(transitions)
-        state, action, reward, after, terminated = map(np.array, zip(*transitions, strict=True))
+        self._due = 1.5 * model.n_instances
+        state, action, reward, after, terminated = map(np.array, zip(*model.transitions(), strict=True))
         if terminated.sum() < ENOUGH:
             return
         length = np.linalg.norm(differences(after, state, self._periodic), axis=1)
@@ -61,6 +61,9 @@ def mean_errors(action: np.ndarray, reward: np.ndarray, after: np.ndarray, termi
 
     :return: both means are over the ends beside which there is one; 0 if these are fewer than ``ENOUGH``
     """
+    # Takes half a second to import, which is not due before there is something to look at.
+    from scipy.spatial import cKDTree
+
     scale = max(float(np.ptp(reward)), 1e-300)
     found = []
     for one in np.unique(action[terminated]).tolist():

@@ -328,7 +328,7 @@ class FittedRMax(PastData):
             callback.on_training_end()
         self.policy.to_unit.warn_of_share(self.policy.scales.observed, self.agent.task.state_names)
         if self.degree == 1 and self.agent.rewards.n_ended > 0:
-            self._ends_check.look(self.agent.model.transitions())
+            self._ends_check.look(self.agent.model)
         return self
 
     def _refuse_changes(self) -> None:
