@@ -31,36 +31,39 @@ class Kernel(NamedTuple):
 
 
 class LocalFit(NamedTuple):
-    """A fit around a state, and work space; with d state variables there are d + 1 numbers: effects, then the reward."""
+    """A fit around a state, and work space; with d state variables there are d + 1 numbers: effects, then the reward.
+
+    Where the action decides how episodes end there is one more, whether one does: 1 or 0.
+    """
 
     item: np.ndarray  # int32, (n_neighbors,): instances, nearest first
     distance: np.ndarray  # float64, the same: squared distances
     factor: np.ndarray  # float64, (d + 1, d + 1): Cholesky's factor of the regression's matrix
     # The mean of each number in row 0, its slopes per unit below; in the last column the leverage in row 0, and by how much an
     # instance at the state itself that is larger by 1 moves the slopes.
-    solution: np.ndarray  # float64, (d + 1, d + 2)
-    low: np.ndarray  # float64, (d + 1,): the least of each number among the instances
+    solution: np.ndarray  # float64, (d + 1, n_numbers + 1)
+    low: np.ndarray  # float64, (n_numbers,): the least of each number among the instances
     high: np.ndarray  # float64, the same: the largest
-    # What is fitted: for each instance 1 and its place, the same weighted, and its numbers. Float64, (d + 1, groups, GROUP).
+    # What is fitted, for each instance: 1 and its place, the same weighted, both float64, (d + 1, groups, GROUP).
     z: np.ndarray
     weighted: np.ndarray
-    number: np.ndarray
+    number: np.ndarray  # its numbers, float64, (n_numbers, groups, GROUP)
 
     @classmethod
-    def empty(cls, n_neighbors: int, n_variables: int) -> "LocalFit":
-        """Make room for a fit to so many instances."""
-        d = n_variables
-        columns = d + 1, (n_neighbors + GROUP - 1) // GROUP, GROUP
+    def empty(cls, n_neighbors: int, n_variables: int, ends_by_action: bool = False) -> "LocalFit":
+        """Make room for a fit to so many instances; ``ends_by_action``: of whether they ended an episode as well."""
+        d, n_numbers = n_variables, n_variables + 1 + ends_by_action
+        groups = (n_neighbors + GROUP - 1) // GROUP, GROUP
         return cls(
             item=np.zeros(n_neighbors, dtype=np.int32),
             distance=np.empty(n_neighbors),
             factor=np.zeros((d + 1, d + 1)),
-            solution=np.zeros((d + 1, d + 2)),
-            low=np.empty(d + 1),
-            high=np.empty(d + 1),
-            z=np.empty(columns),
-            weighted=np.empty(columns),
-            number=np.empty(columns),
+            solution=np.zeros((d + 1, n_numbers + 1)),
+            low=np.empty(n_numbers),
+            high=np.empty(n_numbers),
+            z=np.empty((d + 1, *groups)),
+            weighted=np.empty((d + 1, *groups)),
+            number=np.empty((n_numbers, *groups)),
         )
 
 
@@ -95,21 +98,26 @@ def sum_of_products(a, b, p, q, groups):
 
 
 @inlined
+def ends_by_action(fit):
+    """Whether the last of a fit's numbers is whether an episode ends."""
+    return len(fit.number) > len(fit.z)
+
+
+@inlined
 def write_instances(at, action, length, instances, scale, fit):
     """Write what is fitted, and zeros up to a whole group; how many groups these are."""
     d = len(at)
     per_unit = np.sqrt(-scale)
     z, weighted, number = fit.z, fit.weighted, fit.number
     any_ended = False
-    for k in range(length):
-        any_ended = any_ended or instances.terminated[action, fit.item[k]]
-    reward_going_on = mean_reward(action, length, instances, scale, fit) if any_ended else 0.0
     groups = (length + GROUP - 1) // GROUP
     for k in range(GROUP * groups):
         g, lane = k // GROUP, k % GROUP
         if k >= length:
             for p in range(d + 1):
-                z[p, g, lane], weighted[p, g, lane], number[p, g, lane] = 0.0, 0.0, 0.0
+                z[p, g, lane], weighted[p, g, lane] = 0.0, 0.0
+            for v in range(len(number)):
+                number[v, g, lane] = 0.0
             continue
         i = fit.item[k]
         # Seen from the nearest: far from all instances the ridge would outweigh them.
@@ -119,8 +127,35 @@ def write_instances(at, action, length, instances, scale, fit):
             place = difference(instances.state[action, i, j], at[j], instances.periodic[j]) * per_unit
             z[j + 1, g, lane], weighted[j + 1, g, lane] = place, weight * place
             number[j, g, lane] = instances.effect[action, i, j]
-        number[d, g, lane] = reward_going_on if instances.terminated[action, i] else instances.reward[action, i]
+        number[d, g, lane] = instances.reward[action, i]
+        if ends_by_action(fit):
+            number[d + 1, g, lane] = instances.terminated[action, i]
+        any_ended = any_ended or instances.terminated[action, i]
+    if any_ended:
+        # What an end pays is known by where it is; or else where it leads does not matter.
+        if ends_by_action(fit):
+            for j in range(d):
+                leave_ends_out(j, action, length, instances, fit)
+        else:
+            leave_ends_out(d, action, length, instances, fit)
     return groups
+
+
+@inlined
+def leave_ends_out(v, action, length, instances, fit):
+    """Give the instances that ended an episode the weighted mean of a number of the others; of all, if they all did."""
+    total, mean = 0.0, 0.0
+    for every in range(2):
+        for k in range(length):
+            if every == 1 or not instances.terminated[action, fit.item[k]]:
+                weight = fit.weighted[0, k // GROUP, k % GROUP]
+                total += weight
+                mean += weight * fit.number[v, k // GROUP, k % GROUP]
+        if total > 0.0:
+            break
+    for k in range(length):
+        if instances.terminated[action, fit.item[k]]:
+            fit.number[v, k // GROUP, k % GROUP] = mean / total
 
 
 @inlined
@@ -139,9 +174,10 @@ def write_ranges(length, fit):
 def fit_around(at, action, length, instances, kernel, fit):
     """Fit the numbers of ``action`` around ``at`` to the instances in ``fit.item``, of which there is at least one.
 
-    Of an instance that ended an episode the reward does not count: what an end pays is known by where it is.
+    Of an instance that ended an episode the reward does not count, as what an end pays is known by where it is; or else, where
+    the action decides how episodes end, the effect does not.
     """
-    d = len(at)
+    d, n_numbers = len(at), len(fit.number)
     scale = kernel_scale(fit, length, kernel)
     per_unit = np.sqrt(-scale)
     factor, solution = fit.factor, fit.solution
@@ -150,15 +186,15 @@ def fit_around(at, action, length, instances, kernel, fit):
     for p in range(d + 1):
         for q in range(p + 1):
             factor[p, q] = sum_of_products(fit.weighted, fit.z, p, q, groups)
-        for v in range(d + 1):
+        for v in range(n_numbers):
             solution[p, v] = sum_of_products(fit.weighted, fit.number, p, v, groups)
-        solution[p, d + 1] = 0.0
+        solution[p, n_numbers] = 0.0
     for p in range(1, d + 1):
         factor[p, p] += RIDGE
-    solution[0, d + 1] = 1.0
+    solution[0, n_numbers] = 1.0
     solve(factor, solution)
     for p in range(1, d + 1):
-        for v in range(d + 2):
+        for v in range(n_numbers + 1):
             solution[p, v] *= per_unit
 
 
@@ -184,33 +220,17 @@ def join_prior(prior, kernel, length, fit):
 
     :param prior: what it says of each effect, s, and the weights p, float64, shape (2 * n_variables,)
     """
-    d = len(prior) // 2
+    d, last = len(prior) // 2, len(fit.number)
     leverage = leverage_of(fit, length, kernel)
     for v in range(d):
         p = prior[d + v]
         if p > 0.0:
             pull = p * leverage / (1.0 + p * leverage)
-            moved = pull * (fit.solution[0, v] - prior[v]) / fit.solution[0, d + 1]
+            moved = pull * (fit.solution[0, v] - prior[v]) / fit.solution[0, last]
             for j in range(d + 1):
-                fit.solution[j, v] -= moved * fit.solution[j, d + 1]
+                fit.solution[j, v] -= moved * fit.solution[j, last]
             fit.low[v] = min(fit.low[v], prior[v])
             fit.high[v] = max(fit.high[v], prior[v])
-
-
-@inlined
-def mean_reward(action, length, instances, scale, fit):
-    """The weighted mean reward of those of a fit's instances that did not end an episode; of all, if they all did."""
-    total, reward = 0.0, 0.0
-    for every in range(2):
-        for k in range(length):
-            i = fit.item[k]
-            if every == 1 or not instances.terminated[action, i]:
-                weight = np.exp((fit.distance[k] - fit.distance[0]) * scale)
-                total += weight
-                reward += weight * instances.reward[action, i]
-        if total > 0.0:
-            break
-    return reward / total
 
 
 @compiled

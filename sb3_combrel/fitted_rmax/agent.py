@@ -17,7 +17,15 @@ from typing import Any
 import numpy as np
 
 from sb3_combrel.common.checks import check_resolution
-from sb3_combrel.common.constants import COARSE, LINES_AGAIN, LONGEST_PLAN, SWEEPS_A_STEP, SWEEPS_AT_EPISODE_END
+from sb3_combrel.common.constants import (
+    COARSE,
+    ENDS_AGAIN,
+    LINES_AGAIN,
+    LONGEST_PLAN,
+    SURE_OF_ENDS,
+    SWEEPS_A_STEP,
+    SWEEPS_AT_EPISODE_END,
+)
 from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task
@@ -29,6 +37,7 @@ from sb3_combrel.fitted_rmax.promises import Promises
 from sb3_combrel.fitted_rmax.settings import MODELS, FittedRMaxSettings
 from sb3_combrel.fitted_rmax.workload import warn_if_long, workload
 from sb3_combrel.models.base import NO_PAIRS, Model
+from sb3_combrel.models.ends_by_action import evidence_for_action
 from sb3_combrel.planning.grid import fitting_grid
 from sb3_combrel.planning.lines import moved_lines
 from sb3_combrel.planning.mdp import FiniteMDP
@@ -87,6 +96,8 @@ class FittedRMaxAgent:
         #: Whether the grid is so coarse that it matters where its lines are; with how many instances they are moved next.
         self.is_coarse = self.grid.margin == 0 and 2 ** max(self.grid.resolution) <= COARSE
         self._lines_due = self.model_settings.n_neighbors * task.n_actions
+        # With how many instances it is looked at next what decides how episodes end.
+        self._ends_due = 1
         self.n_sweeps = 0
         #: Whether it has learned from what it has done itself.
         self.has_acted = False
@@ -220,6 +231,7 @@ class FittedRMaxAgent:
             self.promises.pay(environment, reward, self.mdp.gamma)
             self._take_in(state, action, reward, next_state, terminated)
             self._plan(SWEEPS_A_STEP)
+            self._look_at_ends()
             self._move_lines()
 
     def break_off(self) -> None:
@@ -386,6 +398,7 @@ class FittedRMaxAgent:
             self._follow_rewards()
             self._take_in_all(transitions)
             self._plan(SWEEPS_AT_EPISODE_END)
+            self._look_at_ends()
             self._move_lines()
 
     def _take_in_all(self, transitions: Sequence[Transition], observed: bool = False) -> None:
@@ -423,15 +436,34 @@ class FittedRMaxAgent:
             self.rescale(self.task.scaling, self.task.shared_scaling, lines)
         self._lines_due = int(np.ceil(LINES_AGAIN * n))
 
-    def rescale(self, scaling: StateScaling, bounds: StateScaling, lines: np.ndarray | None = None) -> None:
+    def _look_at_ends(self) -> None:
+        """Find out whether the action or where it leads decides how episodes end, whenever experience has grown by half."""
+        n = self.model.n_instances
+        if n < self._ends_due or self.rewards.n_ended == 0 or not self.model_class.asks_what_ends:
+            return
+        evidence, is_so = evidence_for_action(self.model.transitions(), self.periodic), self.model_settings.ends_by_action
+        if (-evidence if is_so else evidence) > SURE_OF_ENDS:
+            self.rescale(self.task.scaling, self.task.shared_scaling, ends_by_action=not is_so)
+        self._ends_due = int(np.ceil(ENDS_AGAIN * n))
+
+    def rescale(
+        self,
+        scaling: StateScaling,
+        bounds: StateScaling,
+        lines: np.ndarray | None = None,
+        ends_by_action: bool | None = None,
+    ) -> None:
         """Compute all anew in other unit coordinates; an interrupt, or an error, leaves all as it was.
 
         :param scaling: raw <-> unit coordinates from now on; ``bounds``: as of :class:`~sb3_combrel.common.task.Task`
         :param lines: of the grid; None: as they are
+        :param ends_by_action: whether the action decides how episodes end; None: as it is
         """
         with self.lock:
             attributes, generator, of_transfer = dict(vars(self)), self.rng.bit_generator.state, self._method.get_state()
             try:
+                if ends_by_action is not None:
+                    self.model_settings = replace(self.model_settings, ends_by_action=ends_by_action)
                 self._rescale(scaling, bounds, self.grid.arrays.lines if lines is None else lines)
             except BaseException:
                 vars(self).update(attributes)
@@ -483,6 +515,7 @@ class FittedRMaxAgent:
                 "promises": self.promises.rows(),
                 "lines": self.grid.arrays.lines.copy(),
                 "lines_due": np.array([float(self._lines_due)]),
+                "ends": np.array([float(self.model_settings.ends_by_action), float(self._ends_due)]),
             }
 
     def set_state(
@@ -493,6 +526,8 @@ class FittedRMaxAgent:
             self.task = self.task if scaling is None else replace(self.task, scaling=scaling, bounds=bounds)
             self.rewards.set_state(state["rewards"])
             self.grid, self._lines_due = self.grid.with_lines(state["lines"]), int(state["lines_due"][0])
+            by_action, self._ends_due = bool(state["ends"][0] > 0.5), int(state["ends"][1])
+            self.model_settings = replace(self.model_settings, ends_by_action=by_action)
             self._bind()
             self._build()
             of_transfer = [name for name in state if name.startswith(OF_TRANSFER)]

@@ -24,7 +24,6 @@ from sb3_combrel.common.observations import with_own_arrays
 from sb3_combrel.common.serialisation import to_plain
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.fitted_rmax.arguments import DEFAULT_POLICY, MAX_SEED, check_actions, check_policy, check_type, policy_and_env
-from sb3_combrel.fitted_rmax.ends_check import EndsCheck
 from sb3_combrel.fitted_rmax.past_data import PastData
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 from sb3_combrel.fitted_rmax.progress import ProgressWatch
@@ -68,7 +67,8 @@ class FittedRMax(PastData):
       is summed in closed form.
     - With ``degree=1`` the planner's model holds an action until a cell of the grid is left: values that are interpolated at
       every step spread over the grid.
-    - With ``degree=1`` whether an episode ends depends on where one arrives (see ``sb3_combrel.models.ends``).
+    - With ``degree=1`` whether an episode ends depends on where one arrives (see ``sb3_combrel.models.ends``); unless the
+      action foretells it clearly better, as in a bandit (:func:`~sb3_combrel.models.ends_by_action.evidence_for_action`).
     - With ``degree=1``, until an episode has ended or rewards have differed, each visit to a place makes it, and an action not
       tried there, worth less by a step (:func:`~sb3_combrel.fitted_rmax.optimism.worth_after_visits`).
     - With four state variables or more, in a task that goes on for ever, the lines of the grid move to where values between
@@ -242,7 +242,6 @@ class FittedRMax(PastData):
         #: Unit coordinates of the last observations while it learns, shape (n_envs, n_variables).
         self._last_states: np.ndarray | None = None
         self._progress = ProgressWatch(self.agent.rewards, self.planning_tolerance)
-        self._ends_check = EndsCheck(self.agent.periodic)
         # They are saved with what was learned from them.
         given, self.instances = self.instances, None
         if given is not None:
@@ -327,8 +326,6 @@ class FittedRMax(PastData):
             self._last_states = None
             callback.on_training_end()
         self.policy.to_unit.warn_of_share(self.policy.scales.observed, self.agent.task.state_names)
-        if self.degree == 1 and self.agent.rewards.n_ended > 0:
-            self._ends_check.look(self.agent.model)
         return self
 
     def _refuse_changes(self) -> None:

@@ -198,6 +198,8 @@ class FittedRMaxPolicy(BasePolicy):
         error_msgs: list[str],
     ) -> None:
         expected = self._learned()
+        # Older files do not have it: there where one arrives decides how episodes end.
+        state_dict.setdefault(prefix + "ends", th.tensor([0.0, 1.0]))
         missing_keys.extend(prefix + name for name in expected if prefix + name not in state_dict)
         unexpected_keys.extend(k for k in state_dict if strict and k.startswith(prefix) and k[len(prefix) :] not in expected)
         if self.transfer is None and any(name.startswith(prefix + "transfer_") for name in state_dict):

@@ -28,6 +28,8 @@ class ModelSettings:
     max_instances: int | None = None
     n_neighbors: int = 40
     outcome_breadth: float = 0.05
+    #: Whether episodes end by where an action is taken, and not by where it leads (see ``models.ends_by_action``).
+    ends_by_action: bool = False
 
 
 class FitOfEffects(NamedTuple):
@@ -91,6 +93,8 @@ class Model(ABC):
     searches: ClassVar[bool] = False
     #: Whether the planner leaves points out on which no change bears that is larger than its tolerance.
     follows_changes: ClassVar[bool] = False
+    #: Whether it has a second way to tell how episodes end, ``ModelSettings.ends_by_action``.
+    asks_what_ends: ClassVar[bool] = False
     #: Whether all pairs of a finer grid are fitted within seconds: a frozen policy may then plan on one.
     plans_finer: ClassVar[bool] = False
 

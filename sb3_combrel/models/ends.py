@@ -25,6 +25,11 @@ class Ends(NamedTuple):
     hint: np.ndarray  # int64 scratch, (2,): action and slot of an arrival near the last state that was asked for
 
     @classmethod
+    def none(cls, n_variables: int) -> "Ends":
+        """No end anywhere, where episodes end by what is done."""
+        return cls(np.empty((0, n_variables)), np.zeros(2, dtype=np.int64))
+
+    @classmethod
     def of(cls, arrivals: Instances) -> "Ends":
         """Those among some arrivals."""
         ended = [arrivals.state[action, :n][arrivals.terminated[action, :n]] for action, n in enumerate(arrivals.size)]

@@ -74,8 +74,8 @@ class GridModel(Model):
 
     #: Successors of an action that the own instances may predict.
     _own_room = 1
-    #: Numbers that are fitted at each pair.
-    _n_fitted = 0
+    #: Coefficients of each number that is fitted at a pair, and numbers.
+    _fitted = 0, 0
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
         super().__init__(mdp, settings, transfer)
@@ -86,7 +86,7 @@ class GridModel(Model):
             n_neighbors=settings.n_neighbors,
             outcome_breadth=min(breadth, float(settings.outcome_breadth)) ** 2,
         )
-        self.pairs = PairArrays.empty(len(self.known), self.kernel.reach, self._n_fitted, self._has_prior)
+        self.pairs = PairArrays.empty(len(self.known), self.kernel.reach, self._fitted, self._has_prior)
         self.own_weight, self.known = self.pairs.weight, self.pairs.known
         self._plain_pairs, self._plain_kernel = tuple(self.pairs), tuple(self.kernel)
         # Where instances are transferred, what is not known is updated when its instances are twice as many.
@@ -94,12 +94,13 @@ class GridModel(Model):
         self._rules = self.kernel.scale, self.exploration_threshold, few
         # Whether an outcome has told states apart.
         self._informed, self._first_reward, self._informed_at = not self.searches, np.nan, 0
-        # Sums of the sizes of effects and rewards, by action.
-        self._sizes = np.zeros((self.n_actions, self.grid.n_variables + 1))
-        self._cell = self.grid.diagonal
         # A variable that hardly ever changes is measured by this part of a cell.
-        self._least_size = np.append(LEAST_SIZE / self.grid.arrays.cells, 1e-9)
-        self._points = tuple(PointScratch.empty(self.grid.arrays, len(self.known)))
+        least = [1e-9, 1e-9] if settings.ends_by_action else [1e-9]
+        self._least_size = np.append(LEAST_SIZE / self.grid.arrays.cells, least)
+        # Sums of the sizes of effects, rewards and ends, by action.
+        self._sizes = np.zeros((self.n_actions, len(self._least_size)))
+        self._cell = self.grid.diagonal
+        self._points = tuple(PointScratch.empty(self.grid.arrays, len(self.known), len(self._least_size)))
         self._nothing = TransferredInstances.empty(1, self.grid.n_variables)
         self._make_prediction(self._own_room)
         # Transitions so far, of which ``max_instances`` may have removed some; the number of each that is there.
@@ -143,7 +144,7 @@ class GridModel(Model):
         self._renew_ends()
 
     def _renew_ends(self) -> None:
-        self.ends = Ends.of(self.arrivals)
+        self.ends = Ends.none(self.grid.n_variables) if self.settings.ends_by_action else Ends.of(self.arrivals)
         self._plain_experience = tuple(self.instances), tuple(self.arrivals), tuple(self.ends)
 
     def add(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> np.ndarray:
@@ -165,7 +166,7 @@ class GridModel(Model):
         due = self._note((state, numbers, size), action, self.kernel.reach, CAME)
         if not self._informed:
             due = self._inform(float(transition[4]), bool(terminated), due)
-        if not terminated:
+        if not terminated or self.settings.ends_by_action:
             return due
         self._renew_ends()
         # What is known of ends concerns all actions that may lead there.
@@ -187,8 +188,9 @@ class GridModel(Model):
         self._informed, self._rules = True, (self._rules[0], ON_GRID * self.exploration_threshold, self._rules[2])
 
     def _numbers_of(self, action: int, slot: int) -> np.ndarray:
-        """Effect and reward of an instance."""
-        return np.append(self.instances.effect[action, slot], self.instances.reward[action, slot])
+        """What is fitted of an instance: effect and reward, and whether it ended an episode where the action decides that."""
+        more = [self.instances.reward[action, slot], self.instances.terminated[action, slot]]
+        return np.append(self.instances.effect[action, slot], more[: len(self._least_size) - self.grid.n_variables])
 
     def _note(self, instance: tuple[np.ndarray, ...], action: int, widest: float, why: int) -> np.ndarray:
         """Note at the pairs of an action what has happened near them; those that are to be fitted."""

@@ -24,16 +24,16 @@ class PairArrays(NamedTuple):
     known: np.ndarray  # bool, (n_pairs,)
     # How much new instances may have changed of what is predicted, in parts of the mean effect; inf: it is fitted at once.
     surprise: np.ndarray  # float64, (n_pairs,)
-    # Means and slopes of effects and reward; (n_pairs, 0, 0) for a model without.
-    fit: np.ndarray  # float64, (n_pairs, d + 1, d + 1)
+    # Means and slopes of the numbers of ``LocalFit``; (n_pairs, 0, 0) for a model without.
+    fit: np.ndarray  # float64, (n_pairs, d + 1, n_numbers)
     # Where a prior joins the fits: those to the own instances alone, as ``LocalFit`` has solution, low and high.
-    own_fit: np.ndarray  # float64, (n_pairs, d + 1, d + 4); (n_pairs, 0, 3) without a prior
+    own_fit: np.ndarray  # float64, (n_pairs, d + 3, n_numbers + 1); (n_pairs, 0, 1) without a prior
     nearest: np.ndarray  # int32, (n_pairs,): the nearest of the instances of the own fit
 
     @classmethod
-    def empty(cls, n_pairs: int, reach: float, n_numbers: int, takes_prior: bool) -> "PairArrays":
-        """Pairs none of which has been fitted; ``n_numbers``: d + 1, or 0 for a model without fits."""
-        n_own = n_numbers if takes_prior else 0
+    def empty(cls, n_pairs: int, reach: float, fitted: tuple[int, int], takes_prior: bool) -> "PairArrays":
+        """Pairs none of which has been fitted; ``fitted``: (d + 1, n_numbers), or (0, 0) for a model without fits."""
+        own = (fitted[0] + 2, fitted[1] + 1) if takes_prior else (0, 1)
         return cls(
             reach=np.full(n_pairs, reach),
             n_new=np.zeros(n_pairs, dtype=np.int32),
@@ -42,8 +42,8 @@ class PairArrays(NamedTuple):
             weight=np.zeros(n_pairs),
             known=np.zeros(n_pairs, dtype=np.bool_),
             surprise=np.zeros(n_pairs),
-            fit=np.zeros((n_pairs, n_numbers, n_numbers)),
-            own_fit=np.zeros((n_pairs, n_own, n_own + 3)),
+            fit=np.zeros((n_pairs, *fitted)),
+            own_fit=np.zeros((n_pairs, *own)),
             nearest=np.zeros(n_pairs, dtype=np.int32),
         )
 
@@ -54,14 +54,14 @@ class PointScratch(NamedTuple):
     along: np.ndarray  # float64, (n_variables, largest axis of the grid): squared distances along one variable
     span: np.ndarray  # int64, (3, n_variables): first grid coordinate within reach, one past the last, the present one
     pair: np.ndarray  # int64, (n_pairs,): pairs that are due
-    predicted: np.ndarray  # float64, (n_variables + 1,): effect and reward that a pair predicts
+    predicted: np.ndarray  # float64, (n_numbers,): what a pair predicts
 
     @classmethod
-    def empty(cls, grid: GridArrays, n_pairs: int) -> "PointScratch":
+    def empty(cls, grid: GridArrays, n_pairs: int, n_numbers: int) -> "PointScratch":
         """Make room for a grid."""
         d = len(grid.shape)
         along = np.empty((d, int(grid.shape.max())))
-        return cls(along, np.empty((3, d), dtype=np.int64), np.empty(n_pairs, dtype=np.int64), np.empty(d + 1))
+        return cls(along, np.empty((3, d), dtype=np.int64), np.empty(n_pairs, dtype=np.int64), np.empty(n_numbers))
 
 
 @inlined
@@ -79,15 +79,14 @@ CAME, WENT, ENDED = range(3)
 @inlined
 def surprise_of(pair, distance, pairs, numbers, state, at, grid, size, predicted):
     """By how much an instance may change what a pair predicts, in parts of the mean size of the action's numbers."""
-    d = len(state)
-    for v in range(d + 1):
+    for v in range(len(numbers)):
         predicted[v] = pairs.fit[pair, 0, v]
-    for k in range(d):
+    for k in range(len(state)):
         away = difference(state[k], unit_of_line(at[k], k, grid), grid.periodic[k])
-        for v in range(d + 1):
+        for v in range(len(numbers)):
             predicted[v] += pairs.fit[pair, k + 1, v] * away
     worst = 0.0
-    for v in range(d + 1):
+    for v in range(len(numbers)):
         worst = max(worst, abs(numbers[v] - predicted[v]) / size[v])
     return worst * np.exp(-PER_BREADTH * distance / pairs.reach[pair]) / max(1.0, SHARE_OF_LIST * pairs.length[pair])
 
@@ -121,7 +120,7 @@ def look_at(pair, distance, widest, why, pairs, instance, at, grid, rules, predi
 def note_instance(instance, first_pair, pairs, widest, why, grid, rules, scratch):
     """Note an instance at all pairs of an action that it concerns; how many are to be fitted, in ``scratch.pair``.
 
-    :param instance: (state; effect and reward, shape (d + 1,); what differences of these are measured by)
+    :param instance: (state; what is fitted of it, shape (n_numbers,); what differences of these are measured by)
     :param first_pair: of the action; plain tuples for ``pairs``, ``grid`` and ``scratch``
     :param widest: squared distance beyond which no pair is concerned
     :param why: CAME, WENT, or ENDED: then the state is where an episode ended

@@ -8,7 +8,16 @@ from sb3_combrel.common.compiled import compiled, entry_point, inlined
 from sb3_combrel.common.constants import MAX_MODEL_STEPS
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.kernels import any_periodic, nearest_instances, squared_distance
-from sb3_combrel.common.regression import Kernel, LocalFit, fit_around, join_prior, known_weight, leverage_of, number_at
+from sb3_combrel.common.regression import (
+    Kernel,
+    LocalFit,
+    ends_by_action,
+    fit_around,
+    join_prior,
+    known_weight,
+    leverage_of,
+    number_at,
+)
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.models.ends import Ends, end_at, far_from_ends, squared_distance_of_end
 from sb3_combrel.models.grid_model import add_to_row, total_weight
@@ -51,16 +60,22 @@ def distances_around(at, action, length, experience, fit):
 
 
 @compiled
-def outcome_of(to, moved, around, experience, kernel, end):
-    """Write to ``end`` what arriving at ``to`` means.
+def outcome_of(fit, away, to, moved, around, experience, kernel, end):
+    """Expected reward of a step from ``away`` of a fit's state to ``to``; writes to ``end`` the probability that it ends.
 
-    :param moved: how far it is from the state around which ``around`` are the :func:`distances_around`
+    :param moved: how far ``to`` is from the fit's state, around which ``around`` are the :func:`distances_around`
     """
+    d = len(to)
+    reward = number_at(fit, d, away)
+    if ends_by_action(fit):
+        end[0] = number_at(fit, d + 1, away)
+        return reward
     _, arrivals, ends = experience
     of_end, near = around
     end[0], end[1] = 0.0, 0.0
     if not far_from_ends(moved, of_end, near, kernel.outcome_breadth):
         end_at(to, (moved + near) ** 2, kernel.outcome_breadth, arrivals, ends, end)
+    return (1.0 - end[0]) * reward + end[0] * end[1]
 
 
 @entry_point
@@ -88,6 +103,8 @@ def predict_own(experience, linear, prior, state, kernel, threshold, fit, scratc
         if length > 0:
             fit_around(state, action, length, instances, kernel, fit)
             join_prior(prior[action], kernel, length, fit)
+        else:
+            fit.solution[:], fit.low[:], fit.high[:] = 0.0, 0.0, 0.0
         scratch.away[:] = 0.0
         moved = 0.0
         for v in range(d):
@@ -95,11 +112,10 @@ def predict_own(experience, linear, prior, state, kernel, threshold, fit, scratc
             prediction.effect[action, 0, v] = effect
             scratch.to[v] = state[v] + effect
             moved += effect * effect
-        reward = number_at(fit, d, scratch.away) if length > 0 else 0.0
         around = distances_around(state, action, length, experience, fit)
-        outcome_of(scratch.to, np.sqrt(moved), around, experience, kernel, scratch.end)
+        reward = outcome_of(fit, scratch.away, scratch.to, np.sqrt(moved), around, experience, kernel, scratch.end)
         end = scratch.end[0]
-        prediction.reward[action] = (1.0 - end) * reward + end * scratch.end[1]
+        prediction.reward[action] = reward
         prediction.length[action] = 1 if end < 1.0 and length > 0 else 0
         prediction.probability[action, 0] = 1.0 - end
         prediction.weight[action] = weight
@@ -173,13 +189,11 @@ def follow(action, length, experience, kernel, fit, grid, at, planned, scratch):
     around = distances_around(scratch.at, action, length, experience, fit)
     for n in range(max_steps):
         inside = take_step(fit, grid, at, scratch)
-        reward = number_at(fit, d, away)
         moved = 0.0
         for k in range(d):
             moved += (away[k] + scratch.step[k]) ** 2
-        outcome_of(scratch.to, np.sqrt(moved), around, experience, kernel, scratch.end)
-        end, pays = scratch.end[0], scratch.end[1]
-        reward = (1.0 - end) * reward + end * pays
+        reward = outcome_of(fit, away, scratch.to, np.sqrt(moved), around, experience, kernel, scratch.end)
+        end = scratch.end[0]
         # The first step is never cut short, nor one that may end the episode.
         taken = 1.0 if n == 0 or end > 0.0 or inside == 0.0 else inside
         total += discount * goes_on * taken * reward
@@ -202,7 +216,8 @@ def keep_own_fit(pair, pairs, fit):
     for p in range(n):
         for v in range(columns):
             kept[p, v] = fit.solution[p, v]
-        kept[p, columns], kept[p, columns + 1] = fit.low[p], fit.high[p]
+    for v in range(len(fit.low)):
+        kept[n, v], kept[n + 1, v] = fit.low[v], fit.high[v]
     pairs.nearest[pair] = fit.item[0]
 
 
@@ -213,7 +228,8 @@ def recall_own_fit(pair, at, action, instances, pairs, fit):
     for p in range(n):
         for v in range(columns):
             fit.solution[p, v] = kept[p, v]
-        fit.low[p], fit.high[p] = kept[p, columns], kept[p, columns + 1]
+    for v in range(len(fit.low)):
+        fit.low[v], fit.high[v] = kept[n, v], kept[n + 1, v]
     fit.item[0] = pairs.nearest[pair]
     wraps = any_periodic(instances.periodic)
     # Of distances the first and the last are used, and the last one of a full list alone.

@@ -33,7 +33,8 @@ class LocalLinear(GridModel):
     instances with a kernel that is narrower where they lie closer: as broad as makes the last of them weigh 0.05. The bias
     of a kernel average is of the order of the breadth, that of a linear fit of the order of its square, so a broad kernel,
     which needs few instances, predicts well. Predicted numbers stay within the range of those of the fitted instances.
-    Whether an episode ends, and what that pays, depends on where one arrives (see ``models.ends``).
+    Whether an episode ends, and what that pays, depends on where one arrives (see ``models.ends``); or both are fitted as
+    effects are (``ModelSettings.ends_by_action``).
 
     A row of the finite MDP leads from a grid point to where its action, held until the cell is left, leads by the pair's
     fit: values interpolated once a cell are nearer to the truth than those interpolated once a step (Munos & Moore 2002).
@@ -45,16 +46,16 @@ class LocalLinear(GridModel):
     Parameters: see :class:`~sb3_combrel.models.base.Model`.
     """
 
-    takes_prior = searches = plans_finer = True
+    takes_prior = searches = plans_finer = asks_what_ends = True
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
-        self._n_fitted = mdp.grid.n_variables + 1
+        self._fitted = mdp.grid.n_variables + 1, mdp.grid.n_variables + 1 + settings.ends_by_action
         super().__init__(mdp, settings, transfer)
         self._prior = transfer if self._has_prior else None
         d, n_pairs, n_near = self.grid.n_variables, len(self.known), settings.n_neighbors
         self.linear = LinearArrays(np.zeros((n_pairs, 2 * d)), np.zeros(d), np.full(self.n_actions, np.inf))
         self._plain_linear = tuple(self.linear)
-        self._fit = tuple(LocalFit.empty(n_near, d))
+        self._fit = tuple(LocalFit.empty(n_near, d, settings.ends_by_action))
         self._scratch = tuple(LinearScratch(*(np.empty(n) for n in (d, d, d, d, 2))))
         self._corners = np.empty(d), np.empty(2**d, dtype=np.int64), np.empty(2**d)
         self._prior_version = -1
@@ -123,7 +124,7 @@ class LocalLinear(GridModel):
         used = weight > 0.0
         if not used.any():
             return np.full((d, d), np.nan), np.full(d, np.nan), np.nan
-        weight, z, effect = weight[used], fit.z.reshape(d + 1, -1).T[used], fit.number.reshape(d + 1, -1).T[used, :d]
+        weight, z, effect = weight[used], fit.z.reshape(d + 1, -1).T[used], fit.number.reshape(len(fit.number), -1).T[used, :d]
         inverse = np.linalg.inv((z.T * weight) @ z + RIDGE * np.diag([0.0] + [1.0] * d))
         residual = effect - z @ (inverse @ (z.T * weight) @ effect)
         freedom = weight.sum() - (weight**2 * ((z @ inverse) * z).sum(axis=1)).sum()

@@ -9,11 +9,16 @@ from sb3_combrel.models.base import ModelSettings
 from sb3_combrel.models.local_linear import LocalLinear
 from sb3_combrel.planning.mdp import FiniteMDP
 
-LINEAR_KERNELS = [
+ENDS_BY_ARRIVAL = [
     dict(breadth=0.3, min_weight=0.01, n_neighbors=5, outcome_breadth=0.05),
     dict(breadth=0.5, min_weight=0.05, n_neighbors=4, outcome_breadth=0.1),
     dict(breadth=0.8, min_weight=0.3, n_neighbors=12, outcome_breadth=2.0),
     dict(breadth=0.2, min_weight=0.05, n_neighbors=2, outcome_breadth=0.05),
+]
+LINEAR_KERNELS = [
+    *ENDS_BY_ARRIVAL,
+    dict(breadth=0.4, min_weight=0.05, n_neighbors=6, outcome_breadth=0.05, ends_by_action=True),
+    dict(breadth=0.8, min_weight=0.3, n_neighbors=12, outcome_breadth=0.05, ends_by_action=True),
 ]
 
 # As in ``kernel_models.GRIDS``, of a few points.
@@ -41,6 +46,7 @@ def make_linear_model(grid, kernel, *, gamma=1.0, max_instances=None, prior=None
         max_instances=max_instances,
         n_neighbors=kernel["n_neighbors"],
         outcome_breadth=kernel["outcome_breadth"],
+        ends_by_action=kernel.get("ends_by_action", False),
     )
     return LocalLinear(FiniteMDP(make_grid(grid), n_actions, gamma), settings, prior)
 

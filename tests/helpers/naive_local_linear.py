@@ -43,7 +43,7 @@ class Fit:
         """The instances come nearest first.
 
         :param away: shape (n, d): where they are, seen from the state; ``squared``: their squared distances
-        :param numbers: shape (n, d + 1)
+        :param numbers: shape (n, d + 1); or (n, d + 2), whether they ended an episode last, if the action decides that
         :param breadth: of the broad kernel
         :param prior: effects, shape (d,), and as how many instances at the state they count, the same
         """
@@ -52,8 +52,10 @@ class Fit:
             breadth = min(breadth, max(NARROWEST * breadth, math.sqrt(squared[-1] / -math.log(LAST_WEIGHT))))
         weights = np.exp((squared[0] - squared) / breadth**2)
         going_on = ~ended if not ended.all() else ended
-        numbers = numbers.copy()
-        numbers[ended, -1] = np.average(numbers[going_on, -1], weights=weights[going_on])
+        numbers, d = numbers.copy(), away.shape[1]
+        # What an end pays is known by where it is; or else where it leads does not matter.
+        for unknown in range(d) if numbers.shape[1] == d + 2 else [d]:
+            numbers[ended, unknown] = np.average(numbers[going_on, unknown], weights=weights[going_on])
         self.mean, slopes = ridge_regression(weights, away / breadth, numbers)
         self.slopes = slopes / breadth
         self.low, self.high = numbers.min(axis=0), numbers.max(axis=0)
@@ -62,7 +64,7 @@ class Fit:
         leverage = np.linalg.inv((design.T * weights) @ design + penalty)[0, 0]
         # In instances at the state; that of the nearest alone bounds it, by the broad kernel.
         sure = min(leverage * math.exp(squared[0] / breadth**2), math.exp(squared[0] / broad**2))
-        self.design, self.penalty, self.weights, self.effects, self.sure = design, penalty, weights, numbers[:, :-1], sure
+        self.design, self.penalty, self.weights, self.effects, self.sure = design, penalty, weights, numbers[:, :d], sure
         for v in np.flatnonzero(prior[1]):
             # An instance of such a weight moves the mean to that of the prior and of own instances worth 1 / sure.
             pull = prior[1][v] / (prior[1][v] + 1.0 / sure)
@@ -80,7 +82,7 @@ class NaiveLocalLinear:
     """The model of a task.
 
     :param grid: (resolution by variable, margin[, periodic[, lines]])
-    :param kernel: dict of ``breadth``, ``min_weight``, ``n_neighbors`` and ``outcome_breadth``
+    :param kernel: dict of ``breadth``, ``min_weight``, ``n_neighbors``, ``outcome_breadth`` and perhaps ``ends_by_action``
     :param prior: function of (state, action) that returns effect and weights, shape (d,) each; None for none
     """
 
@@ -89,6 +91,7 @@ class NaiveLocalLinear:
         self.points = [self.grid.unit(point) for point in range(len(self.grid.coordinates))]
         self.n_points, self.n_actions, self.d = len(self.points), n_actions, len(grid[0])
         self.breadth, self.n_neighbors = kernel["breadth"], kernel["n_neighbors"]
+        self.ends_by_action = kernel.get("ends_by_action", False)
         self.outcome_breadth = min(self.breadth, kernel["outcome_breadth"]) ** 2
         self.reach = -math.log(kernel["min_weight"]) * self.breadth**2
         self.threshold, self.max_instances = threshold, max_instances
@@ -141,7 +144,7 @@ class NaiveLocalLinear:
             return None, 0.0
         squared, instances = np.array([q for q, _ in near]), [i for _, i in near]
         away = np.array([apart(i.state, at, self.grid.periodic) for i in instances])
-        numbers = [np.append(i.effect, i.reward) for i in instances]
+        numbers = [[*i.effect, i.reward, *([float(i.terminated)] if self.ends_by_action else [])] for i in instances]
         ended = np.array([i.terminated for i in instances])
         prior = self.prior_at(at, action)
         fit = Fit(away, squared, np.array(numbers), ended, self.breadth, self.n_neighbors, prior)
@@ -161,19 +164,25 @@ class NaiveLocalLinear:
         rewards = np.array([i.reward for i in arrivals])
         return weights[ended].sum() / weights.sum(), np.average(rewards[ended], weights=weights[ended])
 
-    def outcome(self, at, away, reward, now):
-        """Reward and probability of the end of a step from ``at`` that leads ``away`` from there."""
+    def outcome(self, at, away, numbers, now):
+        """Reward and probability of the end of a step from ``at`` that leads ``away`` from there.
+
+        :param numbers: what is fitted of it besides the effect
+        """
+        if self.ends_by_action:
+            return tuple(numbers)
+        [reward] = numbers
         end, pays = self.end_at(at + away, now)
         return (1.0 - end) * reward + end * pays, end
 
     def at_state(self, state, action):
         """Predict at an exact state, from all transitions."""
         fit, weight = self.fitted(state, action, self.now)
-        effect, reward = self.prior_at(state, action)[0], 0.0
+        numbers = np.append(self.prior_at(state, action)[0], [0.0, 0.0] if self.ends_by_action else [0.0])
         if fit is not None:
-            *of_fit, reward = fit.at(np.zeros(self.d))
-            effect = np.array(of_fit)
-        return Predicted(effect, *self.outcome(state, effect, reward, self.now), weight)
+            numbers = fit.at(np.zeros(self.d))
+        effect = numbers[: self.d]
+        return Predicted(effect, *self.outcome(state, effect, numbers[self.d :], self.now), weight)
 
     def weight_of(self, action, point, now):
         return self.fitted(self.points[point], action, now)[1]
@@ -187,14 +196,14 @@ class NaiveLocalLinear:
         fit, _ = self.fitted(at, action, now)
         away, total, goes_on, discount = np.zeros(self.d), 0.0, 1.0, 1.0
         for n in range(MAX_STEPS):
-            *effect, reward = fit.at(away)
-            after = self.within_grid(point, away + effect)
+            numbers = fit.at(away)
+            after = self.within_grid(point, away + numbers[: self.d])
             stays = (np.abs(after - away) * cells <= 1e-6).all()
             # The part of the step that leaves the cell.
             edge = self.edges(point, after)
             beyond = np.abs(after) > np.abs(edge)
             part = min([1.0, *((edge - away)[beyond] / (after - away)[beyond])])
-            reward, end = self.outcome(at, after, reward, now)
+            reward, end = self.outcome(at, after, numbers[self.d :], now)
             taken = 1.0 if n == 0 or end > 0.0 or stays else part
             total += discount * goes_on * taken * reward
             goes_on *= 1.0 - end

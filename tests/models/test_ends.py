@@ -28,7 +28,7 @@ def found_at(model, state, near=np.inf):
 @settings(deadline=None, derandomize=True, max_examples=25)
 @given(
     st.sampled_from(linear_models.SMALL_GRIDS),
-    st.sampled_from(linear_models.LINEAR_KERNELS),
+    st.sampled_from(linear_models.ENDS_BY_ARRIVAL),
     st.integers(0, 10**6),
     st.integers(1, 120),
     st.sampled_from([None, 10]),
