@@ -33,9 +33,9 @@ BEYOND, TOO_WIDE = 0.05, 2.0
 # Whenever instances are so many times as many, lines go this part of the way there; of their density this part is even, and
 # errors are counted in so many bins of an even cell: dm_control's cart-pole.
 COARSE, LINES_AGAIN, LINE_STEP, EVENLY, BINS_A_CELL = 8, 1.1, 0.25, 0.1, 4
-# Whether the action or where it leads decides how episodes end is looked at whenever instances are so many times as many; the
-# other one does when it has foretold ends better by so many standard errors, far more than chance makes: bandits, selling.
-ENDS_AGAIN, SURE_OF_ENDS = 1.5, 4.0
+# The action decides how episodes end, or where it leads does again, once it has foretold ends better by so many standard
+# errors, far more than chance makes: bandits, selling.
+SURE_OF_ENDS = 4.0
 # Grid points are known with this fraction of the weight that exact states need, once an episode has ended or rewards have
 # differed: nobody gets to those that lie beyond all data, and they would draw the agent for ever. Until then to know how
 # states change is not to know what is there: dm_control's pendulum, point robot.

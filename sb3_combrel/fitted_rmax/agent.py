@@ -19,7 +19,6 @@ import numpy as np
 from sb3_combrel.common.checks import check_resolution
 from sb3_combrel.common.constants import (
     COARSE,
-    ENDS_AGAIN,
     LINES_AGAIN,
     LONGEST_PLAN,
     SURE_OF_ENDS,
@@ -437,14 +436,14 @@ class FittedRMaxAgent:
         self._lines_due = int(np.ceil(LINES_AGAIN * n))
 
     def _look_at_ends(self) -> None:
-        """Find out whether the action or where it leads decides how episodes end, whenever experience has grown by half."""
+        """Find out whether the action or where it leads decides how episodes end, whenever experience has doubled."""
         n = self.model.n_instances
         if n < self._ends_due or self.rewards.n_ended == 0 or not self.model_class.asks_what_ends:
             return
         evidence, is_so = evidence_for_action(self.model.transitions(), self.periodic), self.model_settings.ends_by_action
         if (-evidence if is_so else evidence) > SURE_OF_ENDS:
             self.rescale(self.task.scaling, self.task.shared_scaling, ends_by_action=not is_so)
-        self._ends_due = int(np.ceil(ENDS_AGAIN * n))
+        self._ends_due = 2 * n
 
     def rescale(
         self,

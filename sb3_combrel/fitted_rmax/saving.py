@@ -206,28 +206,30 @@ def _naming(path: object, changed: Sequence[str] = ()) -> Iterator[None]:
     except (FileNotFoundError, PermissionError):
         raise
     except Exception as error:
+        version, policy = _origin(path)
+        if policy and not policy.startswith(f"{__name__.partition('.')[0]}."):
+            raise ValueError(f"{path} is a model of another algorithm, of {policy}: load it with its own class") from error
+        if "spaces do not match" in str(error):
+            raise ValueError(f"{path} is a model of another task than env; those of the file come first: {error}") from error
         wrong = f"is not the file of a model of FittedRMax, is damaged, or does not fit ({damage_text(error)})"
-        instead = (
-            f"; leave out {', '.join(changed)}, or make a new model with them: FittedRMax(env, instances={str(path)!r}, ...)"
-        )
-        raise ValueError(f"{path} {wrong}{instead if changed else ''}{_other_version(path)}") from error
+        if changed:
+            wrong += f"; leave out {', '.join(changed)}, or make a new model: FittedRMax(env, instances={str(path)!r}, ...)"
+        if version not in ("", __version__):
+            wrong += f"; it was saved by sb3_combrel {version}, which can load it, and this is {__version__}"
+        raise ValueError(f"{path} {wrong}") from error
 
 
-def _other_version(path: object) -> str:
-    """Say that the file of a model was saved by another version of this package, if so."""
+def _origin(path: object) -> tuple[str, str]:
+    """The version of this package that has saved a file, and the module of its policy; empty where nothing is known."""
     if isinstance(path, str | Path) and not Path(path).exists():
         path = f"{path}.zip"
     try:
         with zipfile.ZipFile(path) as archive:  # type: ignore[call-overload]
             data = json.loads(archive.read("data"))
-            version, policy = data.get("package_version", "before 0.2"), data.get("policy_class", {}).get("__module__", "")
+            return data.get("package_version", "before 0.2"), data.get("policy_class", {}).get("__module__", "")
     except Exception:
-        # Damaged content makes libraries raise anything; then nothing is known.
-        return ""
-    if policy and not policy.startswith(f"{__name__.partition('.')[0]}."):
-        return f"; it is a model of another algorithm, of {policy}: load it with its own class"
-    same = version == __version__
-    return "" if same else f"; it was saved by sb3_combrel {version}, which can load it, and this is {__version__}"
+        # Damaged content makes libraries raise anything.
+        return "", ""
 
 
 def _is_tensors(parameters: Any) -> bool:

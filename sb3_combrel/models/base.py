@@ -107,7 +107,9 @@ class Model(ABC):
         # Weight of each pair's own instances, and whether it reaches the threshold.
         self.own_weight = np.zeros(n_pairs)
         self.known = np.zeros(n_pairs, dtype=np.bool_)
-        self._oldest = np.zeros(self.n_actions, dtype=np.int64)
+        # Transitions so far, of which ``max_instances`` may have removed some; the number of each that is there.
+        self.n_added = 0
+        self._number = np.zeros((self.n_actions, self.instances.capacity), dtype=np.int64)
 
     @abstractmethod
     def predict(self, states: np.ndarray, actions: np.ndarray) -> Predictions:
@@ -128,13 +130,14 @@ class Model(ABC):
         :param state: shape (n_variables,); ``next_state``: the same
         :param terminated: the episode ended in a terminal state; a time limit is none
         """
-        slot = int(self.instances.size[action])
-        if self.settings.max_instances is not None and slot >= self.settings.max_instances:
-            slot = int(self._oldest[action])
-            self._oldest[action] = (slot + 1) % self.settings.max_instances
+        slot = size = int(self.instances.size[action])
+        if self.settings.max_instances is not None and size >= self.settings.max_instances:
+            slot = int(self._number[action, :size].argmin())
         else:
-            self.instances = self.instances.enlarged(slot + 1)
+            self._make_room(size + 1)
         put_instance_at.call(self.instances, (action, slot, state, next_state, reward, terminated))
+        self.n_added += 1
+        self._number[action, slot] = self.n_added
         return np.arange(action * self.grid.n_points, (action + 1) * self.grid.n_points)
 
     def outdated(self) -> np.ndarray:
@@ -150,7 +153,12 @@ class Model(ABC):
 
     def _numbers(self) -> np.ndarray:
         """When each instance came, by action as in ``Instances.rows``."""
-        return np.concatenate([np.arange(n) for n in self.instances.size.tolist()])
+        return np.concatenate([self._number[action, :n] for action, n in enumerate(self.instances.size.tolist())])
+
+    def _make_room(self, capacity: int) -> None:
+        """Make room for at least so many instances of each action."""
+        self.instances = self.instances.enlarged(capacity)
+        self._number = np.pad(self._number, ((0, 0), (0, self.instances.capacity - self._number.shape[1])))
 
     def update_rows(self, pairs: np.ndarray) -> None:
         """Bring the rows of at most ``MAX_PAIRS_AT_ONCE`` pairs up to date with the instances and with what is transferred."""
@@ -190,7 +198,7 @@ class Model(ABC):
         return model
 
     def _share_instances(self, other: Model) -> None:
-        self.instances = other.instances
+        self.instances, self._number, self.n_added = other.instances, other._number, other.n_added
 
     def predict_alone(self, state: np.ndarray, action: int) -> tuple[np.ndarray, float]:
         """Predict the effect of an action at a state without a prior.
@@ -209,16 +217,22 @@ class Model(ABC):
 
     def get_state(self) -> dict[str, np.ndarray]:
         """What has been learned, float64 arrays, to be saved; their names and widths do not change."""
-        by_action = np.split(self.instances.rows(), np.cumsum(self.instances.size)[:-1])
-        # The oldest first, so that they are replaced first after loading as well.
-        rows = np.vstack([np.roll(some, -oldest, axis=0) for some, oldest in zip(by_action, self._oldest, strict=True)])
-        return {"instances": np.column_stack([rows, np.ones(len(rows))])}
+        return {"instances": np.column_stack([self.instances.rows(), self._numbers()])}
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Take over what :meth:`get_state` returned, and update all rows of the finite MDP; for a new model."""
-        self.instances = Instances.from_rows(self.n_actions, state["instances"][:, :-1], self.grid.arrays.periodic)
-        self._oldest[:] = 0
+        self._put_in_order(state["instances"])
+        self.n_added = int(self._number.max())
         self.update_all(np.arange(len(self.known)))
+
+    def _put_in_order(self, rows: np.ndarray) -> None:
+        """Put instances where they were: sums over all of them depend on their order, in the last bit."""
+        self.instances = Instances.from_rows(self.n_actions, rows[:, :-1], self.grid.arrays.periodic)
+        by_action = np.argsort(rows[:, 0], kind="stable")
+        numbers = np.split(rows[by_action, -1].astype(np.int64), np.cumsum(self.instances.size)[:-1])
+        self._number = np.zeros((self.n_actions, self.instances.capacity), dtype=np.int64)
+        for action, own in enumerate(numbers):
+            self._number[action, : len(own)] = own
 
     def update_all(self, pairs: np.ndarray) -> None:
         """:meth:`update_rows` of any number of pairs."""

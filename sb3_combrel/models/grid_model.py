@@ -103,9 +103,6 @@ class GridModel(Model):
         self._points = tuple(PointScratch.empty(self.grid.arrays, len(self.known), len(self._least_size)))
         self._nothing = TransferredInstances.empty(1, self.grid.n_variables)
         self._make_prediction(self._own_room)
-        # Transitions so far, of which ``max_instances`` may have removed some; the number of each that is there.
-        self.n_added = 0
-        self._number = np.zeros((self.n_actions, self.instances.capacity), dtype=np.int64)
         self._renew_arrivals()
 
     @property
@@ -219,9 +216,7 @@ class GridModel(Model):
         return size, NO_PAIRS
 
     def _make_room(self, capacity: int) -> None:
-        """Make room for so many instances of each action."""
-        self.instances = self.instances.enlarged(capacity)
-        self._number = np.pad(self._number, ((0, 0), (0, self.instances.capacity - self._number.shape[1])))
+        super()._make_room(capacity)
         self._renew_arrivals()
 
     def end_episode(self) -> np.ndarray:
@@ -231,7 +226,6 @@ class GridModel(Model):
     def _share_instances(self, other: Model) -> None:
         assert isinstance(other, GridModel)
         super()._share_instances(other)
-        self.n_added = other.n_added
         self._renew_arrivals()
         if other._informed:
             self._set_informed()
@@ -281,12 +275,9 @@ class GridModel(Model):
         used = np.arange(probability.shape[1]) < length[:, None]
         return Predictions(weight, reward, np.where(used, probability, 0.0), np.where(used[:, :, None], effect, 0.0))
 
-    def _numbers(self) -> np.ndarray:
-        return np.concatenate([self._number[action, :n] for action, n in enumerate(self.instances.size.tolist())])
-
     def get_state(self) -> dict[str, np.ndarray]:
         return {
-            "instances": np.column_stack([self.instances.rows(), self._numbers()]),
+            **super().get_state(),
             "fitted_at": self.pairs.fitted_at.astype(np.float64),
             "n_added": np.array([float(self.n_added), float(self._informed_at)]),
         }
@@ -312,12 +303,7 @@ class GridModel(Model):
         self._put_in_order(state["instances"])
 
     def _put_in_order(self, rows: np.ndarray) -> None:
-        """Put instances where they were: sums over all of them depend on their order, in the last bit."""
-        self.instances = Instances.from_rows(self.n_actions, rows[:, :-1], self.grid.arrays.periodic)
-        by_action = np.argsort(rows[:, 0], kind="stable")
-        numbers = np.split(rows[by_action, -1].astype(np.int64), np.cumsum(self.instances.size)[:-1])
-        for action, own in enumerate(numbers):
-            self._number[action, : len(own)] = own
+        super()._put_in_order(rows)
         self._renew_arrivals()
 
     def _fit_until(self, due: deque[tuple[int, np.ndarray]], number: int) -> None:

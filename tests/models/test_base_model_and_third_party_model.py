@@ -242,9 +242,10 @@ def assert_same_parameters(one, other):
 def test_beyond_max_instances_a_third_party_model_replaces_its_oldest_instances(tmp_path):
     model = third_party(TRANSFERS["none"], max_instances=15).learn(150)
     agent, expected = model.agent, [np.empty((0, 2))] * 2
-    rng = np.random.default_rng(0)
+    rng, came = np.random.default_rng(0), []
     for _ in range(60):
         state, action = rng.random(2), int(rng.integers(2))
+        came.append((action, state))
         agent.update(state, action, -1.0, state, False)
         expected[action] = np.vstack([expected[action], state])[-15:]
     for action, states in enumerate(expected):
@@ -254,6 +255,9 @@ def test_beyond_max_instances_a_third_party_model_replaces_its_oldest_instances(
     model.save(tmp_path / "model")
     again = FittedRMax.load(tmp_path / "model").agent
     for one in (agent, again):
+        order = [(action, tuple(state)) for state, action, *_ in one.model.transitions()]
+        kept = [(action, tuple(state)) for action, state in came if tuple(state) in {tuple(s) for s in expected[action]}]
+        assert order == kept, "in the order in which they came"
         one.update(np.array([0.5, 0.5]), 0, -1.0, np.array([0.5, 0.5]), False)
     states = [{tuple(state) for state in one.model.instances.state[0, :15]} for one in (agent, again)]
     assert states[0] == states[1] == {tuple(state) for state in [*expected[0][1:], (0.5, 0.5)]}, "also after loading"

@@ -50,8 +50,8 @@ def test_more_instances_are_taken_in(file):
     [
         ({"max_valu": 3.0}, "did you mean 'max_value'"),
         ({"max_instances": 10}, "max_instances must be at least"),
-        ({"resolution": 2}, "leave out resolution, or make a new model with them: FittedRMax"),
-        ({"transfer": COMBREL(walk_source())}, "leave out transfer, or make a new model with them"),
+        ({"resolution": 2}, "leave out resolution, or make a new model: FittedRMax"),
+        ({"transfer": COMBREL(walk_source())}, "leave out transfer, or make a new model"),
     ],
 )
 def test_what_cannot_be_changed_is_refused(file, change, message):
@@ -61,7 +61,7 @@ def test_what_cannot_be_changed_is_refused(file, change, message):
 
 def test_a_model_of_another_algorithm_is_named_without_its_suffix(tmp_path):
     DQN("MlpPolicy", Walk(), buffer_size=10).save(tmp_path / "dqn")
-    with pytest.raises(ValueError, match="it is a model of another algorithm"):
+    with pytest.raises(ValueError, match="is a model of another algorithm"):
         FittedRMax.load(tmp_path / "dqn")
 
 
