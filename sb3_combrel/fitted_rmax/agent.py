@@ -194,7 +194,7 @@ class FittedRMaxAgent:
         if best < 0:
             ties = np.flatnonzero(self._q.q == self._q.q.max())
             best = int(ties[self.rng.integers(len(ties))])
-        chosen = self.promises.choose(environment, state, float(self._q.q.max()), best, self.rng)
+        chosen = self.promises.choose(environment, state, max(self._q.q.tolist()), best, self.rng)
         if not prediction.modelled[chosen]:
             self.n_optimistic_actions += 1
         return chosen
@@ -425,8 +425,7 @@ class FittedRMaxAgent:
         That is by how much a value interpolated at a state differs from the best action's there; the latter half of the
         experience counts. Where there is an end to come to, lines stay: no place is for staying.
         """
-        n = self.model.n_instances
-        if not self._lines_move or n < self._lines_due:
+        if not self._lines_move or (n := self.model.n_instances) < self._lines_due:
             return
         states, values = [state for state, *_ in self.model.transitions()[n // 2 :]], self.planner.values
         errors = [abs(self.grid.interpolate(values, state) - self.q_values(state).max()) for state in states]
@@ -437,8 +436,7 @@ class FittedRMaxAgent:
 
     def _look_at_ends(self) -> None:
         """Find out whether the action or where it leads decides how episodes end, whenever experience has doubled."""
-        n = self.model.n_instances
-        if n < self._ends_due or self.rewards.n_ended == 0 or not self.model_class.asks_what_ends:
+        if not self.model_class.asks_what_ends or self.rewards.n_ended == 0 or (n := self.model.n_instances) < self._ends_due:
             return
         evidence, is_so = evidence_for_action(self.model.transitions(), self.periodic), self.model_settings.ends_by_action
         if (-evidence if is_so else evidence) > SURE_OF_ENDS:

@@ -38,6 +38,7 @@ class Promises:
 
     def __init__(self, grid: StateGrid, n_actions: int):
         self._grid, self._n_actions = grid, n_actions
+        self._axes = list(zip(grid.arrays.periodic.tolist(), grid.arrays.cells.tolist(), strict=True))
         #: By environment.
         self.stays: dict[int, Stay] = {}
 
@@ -74,8 +75,10 @@ class Promises:
     def _has_left(self, state: np.ndarray, before: np.ndarray) -> bool:
         grid = self._grid.arrays
         if grid.even:
-            apart = np.abs(state - before)
-            return bool((np.where(grid.periodic, np.minimum(apart, 1.0 - apart), apart) * grid.cells >= 1.0).any())
+            return any(
+                (min(abs(here - there), 1.0 - abs(here - there)) if periodic else abs(here - there)) * cells >= 1.0
+                for here, there, (periodic, cells) in zip(state.tolist(), before.tolist(), self._axes, strict=True)
+            )
         here, there = self._grid.coordinates(np.stack([state, before]))
         apart = np.abs(here - there)
         return bool((np.where(grid.periodic, np.minimum(apart, grid.shape - apart), apart) >= 1.0).any())

@@ -122,7 +122,7 @@ class Model(ABC):
     @property
     def n_instances(self) -> int:
         """Number of instances, of all actions."""
-        return int(self.instances.size.sum())
+        return sum(self.instances.size.tolist())
 
     def add(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> np.ndarray:
         """Add one transition; the pairs whose rows are to be updated, int64, by default all of the action.

@@ -49,6 +49,17 @@ def put_arrival(instances, arrivals, action, slot):
         arrivals.block_high[action, k, block] = max(arrivals.block_high[action, k, block], at)
 
 
+@inlined
+def write_numbers(instances, action, slot, numbers):
+    """Write what is fitted of an instance: effect and reward, and whether it ended an episode if there is room for that."""
+    d = len(instances.periodic)
+    for k in range(d):
+        numbers[k] = instances.effect[action, slot, k]
+    numbers[d] = instances.reward[action, slot]
+    if len(numbers) > d + 1:
+        numbers[d + 1] = instances.terminated[action, slot]
+
+
 @entry_point
 def put_arrivals(instances, arrivals):
     """Write where all instances lead."""
@@ -58,18 +69,25 @@ def put_arrivals(instances, arrivals):
 
 
 @entry_point
-def put_transition(instances, arrivals, transition, effect):
+def put_transition(instances, arrivals, transition, effect, measured):
     """Write an instance to its slot, and where it leads; plain tuples.
 
     :param transition: (action, slot, state, next_state, reward, terminated)
     :param effect: counts in place of next state minus state, if it is not empty
+    :param measured: (sums of the sizes of effect, reward and perhaps end by action; the least mean sizes; both of these are
+        written: what is fitted of this instance, the mean sizes of its action), see ``GridModel``
     """
     instances, arrivals = Instances(*instances), Instances(*arrivals)
     action, slot, _, _, _, _ = transition
+    sums, least, numbers, size = measured
     put_instance(instances, transition)
     for k in range(len(effect)):
         instances.effect[action, slot, k] = effect[k]
     put_arrival(instances, arrivals, action, slot)
+    write_numbers(instances, action, slot, numbers)
+    for v in range(len(numbers)):
+        sums[action, v] += abs(numbers[v])
+        size[v] = max(sums[action, v] / instances.size[action], least[v])
 
 
 @compiled

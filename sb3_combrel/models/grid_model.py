@@ -96,11 +96,12 @@ class GridModel(Model):
         self._informed, self._first_reward, self._informed_at = not self.searches, np.nan, 0
         # A variable that hardly ever changes is measured by this part of a cell.
         least = [1e-9, 1e-9] if settings.ends_by_action else [1e-9]
-        self._least_size = np.append(LEAST_SIZE / self.grid.arrays.cells, least)
-        # Sums of the sizes of effects, rewards and ends, by action.
-        self._sizes = np.zeros((self.n_actions, len(self._least_size)))
+        least_size = np.append(LEAST_SIZE / self.grid.arrays.cells, least)
+        # Of effects, rewards and ends: sums of sizes by action, the least mean sizes; the last instance's, and mean sizes.
+        n = len(least_size)
+        self._measured = np.zeros((self.n_actions, n)), least_size, np.zeros(n), np.zeros(n)
         self._cell = self.grid.diagonal
-        self._points = tuple(PointScratch.empty(self.grid.arrays, len(self.known), len(self._least_size)))
+        self._points = tuple(PointScratch.empty(self.grid.arrays, len(self.known), n))
         self._nothing = TransferredInstances.empty(1, self.grid.n_variables)
         self._make_prediction(self._own_room)
         self._renew_arrivals()
@@ -151,16 +152,12 @@ class GridModel(Model):
 
     def _put(self, transition: tuple[Any, ...], effect: np.ndarray = NO_EFFECT) -> np.ndarray:
         """Write an instance to its slot; the pairs that are due. ``effect``: in place of next state minus state."""
-        action, slot, state, _, _, terminated = transition
-        put_transition.call(*self._plain_experience[:2], transition, effect)
+        action, slot, *_, terminated = transition
+        put_transition.call(*self._plain_experience[:2], transition, effect, self._measured)
         self.n_added += 1
         self._number[action, slot] = self.n_added
-        numbers = self._numbers_of(action, slot)
-        sizes = self._sizes[action]
-        sizes += np.abs(numbers)
-        size = np.maximum(sizes / self.instances.size[action], self._least_size)
-        state = self.instances.state[action, slot]
-        due = self._note((state, numbers, size), action, self.kernel.reach, CAME)
+        numbers_and_size = self._measured[2:]
+        due = self._note((self.instances.state[action, slot], *numbers_and_size), action, self.kernel.reach, CAME)
         if not self._informed:
             due = self._inform(float(transition[4]), bool(terminated), due)
         if not terminated or self.settings.ends_by_action:
@@ -169,7 +166,7 @@ class GridModel(Model):
         # What is known of ends concerns all actions that may lead there.
         arrived, noted = self.arrivals.state[action, slot], [due]
         widest = (self._cell + float(np.linalg.norm(self.instances.effect[action, slot]))) ** 2
-        noted += [self._note((arrived, numbers, size), other, widest, ENDED) for other in range(self.n_actions)]
+        noted += [self._note((arrived, *numbers_and_size), other, widest, ENDED) for other in range(self.n_actions)]
         return np.unique(np.concatenate(noted))
 
     def _inform(self, reward: float, terminated: bool, due: np.ndarray) -> np.ndarray:
@@ -183,11 +180,6 @@ class GridModel(Model):
 
     def _set_informed(self) -> None:
         self._informed, self._rules = True, (self._rules[0], ON_GRID * self.exploration_threshold, self._rules[2])
-
-    def _numbers_of(self, action: int, slot: int) -> np.ndarray:
-        """What is fitted of an instance: effect and reward, and whether it ended an episode where the action decides that."""
-        more = [self.instances.reward[action, slot], self.instances.terminated[action, slot]]
-        return np.append(self.instances.effect[action, slot], more[: len(self._least_size) - self.grid.n_variables])
 
     def _note(self, instance: tuple[np.ndarray, ...], action: int, widest: float, why: int) -> np.ndarray:
         """Note at the pairs of an action what has happened near them; those that are to be fitted."""
@@ -203,8 +195,9 @@ class GridModel(Model):
         if self.settings.max_instances is not None and size >= self.settings.max_instances:
             apart = differences(instances.state[action, :size], state, instances.periodic)
             slot = int((apart**2).sum(axis=1).argmin())
-            numbers = self._numbers_of(action, slot)
-            self._sizes[action] = np.maximum(self._sizes[action] - np.abs(numbers), 0.0)
+            sums, _, numbers, _ = self._measured
+            gone = [*instances.effect[action, slot], instances.reward[action, slot], instances.terminated[action, slot]]
+            sums[action] = np.maximum(sums[action] - np.abs(gone[: len(numbers)]), 0.0)
             instance = instances.state[action, slot], numbers, numbers
             removed = self._note(instance, action, self.kernel.reach, WENT)
             if instances.terminated[action, slot]:

@@ -104,7 +104,7 @@ def test_sizes_are_those_of_the_instances_that_are_kept(degree):
         agent.update(state, 0, float(rng.normal()), np.clip(state + 0.1 * rng.normal(size=1), 0.0, 1.0), False)
     model = agent.model
     kept = model.instances.effect[0, :10], model.instances.reward[0, :10]
-    np.testing.assert_allclose(model._sizes[0], [np.abs(kept[0]).sum(), np.abs(kept[1]).sum()], atol=1e-9)
+    np.testing.assert_allclose(model._measured[0][0], [np.abs(kept[0]).sum(), np.abs(kept[1]).sum()], atol=1e-9)
 
 
 def test_an_interrupt_loses_no_pair_that_is_due(monkeypatch):
