@@ -1,9 +1,9 @@
 """Weighted local linear regression on the instances nearest to a state: mean, slopes, and how sure they are.
 
 The one fit of the package: grid pairs, exact states and sources use it. With z = (x - at) / breadth, the numbers y of an
-instance at x (its effect, and its reward) are modelled as y = mean + slopes^T z by weighted least squares with a ridge on the
-slopes (Atkeson, Moore & Schaal 1997, "Locally weighted learning", Section 4.2). The kernel is as broad as makes the last of
-``n_neighbors`` instances weigh 0.05, and no broader than ``breadth``.
+instance at x (its effect, its reward, and perhaps whether it ended an episode) are modelled as y = mean + slopes^T z by
+weighted least squares with a ridge on the slopes (Atkeson, Moore & Schaal 1997, "Locally weighted learning", Section 4.2). The
+kernel is as broad as makes the last of ``n_neighbors`` instances weigh 0.05, and no broader than ``breadth``.
 """
 
 from typing import NamedTuple

@@ -95,7 +95,7 @@ class FittedRMaxAgent:
         #: Whether the grid is so coarse that it matters where its lines are; with how many instances they are moved next.
         self.is_coarse = self.grid.margin == 0 and 2 ** max(self.grid.resolution) <= COARSE
         self._lines_due = self.model_settings.n_neighbors * task.n_actions
-        # With how many instances it is looked at next what decides how episodes end.
+        # After how many ends it is looked at next what decides them.
         self._ends_due = 1
         self.n_sweeps = 0
         #: Whether it has learned from what it has done itself.
@@ -435,13 +435,13 @@ class FittedRMaxAgent:
         self._lines_due = int(np.ceil(LINES_AGAIN * n))
 
     def _look_at_ends(self) -> None:
-        """Find out whether the action or where it leads decides how episodes end, whenever experience has doubled."""
-        if not self.model_class.asks_what_ends or self.rewards.n_ended == 0 or (n := self.model.n_instances) < self._ends_due:
+        """Find out whether the action or where it leads decides how episodes end, whenever ends are twice as many."""
+        if not self.model_class.asks_what_ends or self.rewards.n_ended < self._ends_due:
             return
-        evidence, is_so = evidence_for_action(self.model.transitions(), self.periodic), self.model_settings.ends_by_action
+        evidence, is_so = evidence_for_action(self.model.transitions()), self.model_settings.ends_by_action
         if (-evidence if is_so else evidence) > SURE_OF_ENDS:
             self.rescale(self.task.scaling, self.task.shared_scaling, ends_by_action=not is_so)
-        self._ends_due = 2 * n
+        self._ends_due = 2 * self.rewards.n_ended
 
     def rescale(
         self,

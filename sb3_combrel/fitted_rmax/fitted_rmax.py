@@ -433,7 +433,9 @@ class FittedRMax(PastData):
         self.logger.dump(step=self.num_timesteps)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        refuse_normalized_observations(env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env]))
+        given = env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])
+        refuse_normalized_observations(given)
+        joined_names(self._names, names_of(given))
         super().set_env(env, force_reset)
         assert self.env is not None
         self._vec_normalize_env = unwrap_vec_normalize(self.env)

@@ -32,6 +32,8 @@ COMPRESSION = 1
 # Arguments by which what was learned is laid out: another model takes the instances. And those that values depend on.
 NOT_TO_CHANGE = {"degree", "max_instances", "model_breadth", "periodic", "resolution", "transfer"}
 OF_VALUES = {"gamma", "max_value"}
+# The version of a file that names none, as those of other algorithms do not.
+BEFORE = "before 0.2"
 
 SelfSavedAlgorithm = TypeVar("SelfSavedAlgorithm", bound="SavedAlgorithm")
 
@@ -207,10 +209,11 @@ def _naming(path: object, changed: Sequence[str] = ()) -> Iterator[None]:
         raise
     except Exception as error:
         version, policy = _origin(path)
-        if policy and not policy.startswith(f"{__name__.partition('.')[0]}."):
+        # A policy may be one of the user's own.
+        if version == BEFORE and not policy.startswith(f"{__name__.partition('.')[0]}."):
             raise ValueError(f"{path} is a model of another algorithm, of {policy}: load it with its own class") from error
-        if "spaces do not match" in str(error):
-            raise ValueError(f"{path} is a model of another task than env; those of the file come first: {error}") from error
+        if "spaces do not match" in str(error) or str(error).startswith("env must have"):
+            raise ValueError(f"{path} is a model of another task than env: {error}") from error
         wrong = f"is not the file of a model of FittedRMax, is damaged, or does not fit ({damage_text(error)})"
         if changed:
             wrong += f"; leave out {', '.join(changed)}, or make a new model: FittedRMax(env, instances={str(path)!r}, ...)"
@@ -226,7 +229,7 @@ def _origin(path: object) -> tuple[str, str]:
     try:
         with zipfile.ZipFile(path) as archive:  # type: ignore[call-overload]
             data = json.loads(archive.read("data"))
-            return data.get("package_version", "before 0.2"), data.get("policy_class", {}).get("__module__", "")
+            return data.get("package_version", BEFORE), data.get("policy_class", {}).get("__module__", "")
     except Exception:
         # Damaged content makes libraries raise anything.
         return "", ""

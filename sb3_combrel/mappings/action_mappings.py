@@ -37,13 +37,9 @@ class ActionMappings(ABC):
     def __getitem__(self, index: int) -> tuple[int, ...]:
         """The action mapping of that number, from 0 to ``n_mappings - 1``."""
 
-    @abstractmethod
-    def count(self, action: int, source_action: int) -> int:
-        """Number of the action mappings that map target action ``action`` to ``source_action``."""
-
     def first(self, action: int, source_action: int) -> int:
         """Number of the first of them; ``ValueError`` if there is none."""
-        if not self.count(action, source_action):
+        if source_action not in self.source_actions_for(action):
             raise ValueError(
                 f"no mapping of the set maps target action {action} to source action {source_action}; "
                 f"the possible source actions are {self.source_actions_for(action).tolist()}"
@@ -82,9 +78,6 @@ class AllActionMappings(ActionMappings):
         n = self.n_source_actions
         return tuple(index // n**place % n for place in reversed(range(self.n_target_actions)))
 
-    def count(self, action: int, source_action: int) -> int:
-        return self.n_source_actions ** (self.n_target_actions - 1) if 0 <= source_action < self.n_source_actions else 0
-
     def _first(self, action: int, source_action: int) -> int:
         return source_action * self.n_source_actions ** (self.n_target_actions - 1 - action)
 
@@ -116,10 +109,6 @@ class BalancedActionMappings(ActionMappings):
                     break
                 index -= following
         return tuple(chosen)
-
-    def count(self, action: int, source_action: int) -> int:
-        # By symmetry: the mappings are closed under permutations of the target actions and of the source actions.
-        return self.n_mappings // self.n_source_actions if 0 <= source_action < self.n_source_actions else 0
 
     def _first(self, action: int, source_action: int) -> int:
         # The first such mapping has at each position the first choice that leaves a `source_action` for position `action`.
@@ -183,9 +172,6 @@ class ListedActionMappings(ActionMappings):
     def __getitem__(self, index: int) -> tuple[int, ...]:
         self._check_index(index)
         return tuple(self.mappings[index].tolist())
-
-    def count(self, action: int, source_action: int) -> int:
-        return int(np.count_nonzero(self.mappings[:, action] == source_action))
 
     def _first(self, action: int, source_action: int) -> int:
         return int((self.mappings[:, action] == source_action).argmax())

@@ -303,18 +303,6 @@ class MappingSet:
         different = np.unique(np.column_stack([self._states, self._source_actions[:, action]]), axis=0)
         return Candidates(different[:, 0].copy(), different[:, 1].copy())
 
-    def count(self, state_index: int, action: int, source_action: int) -> int:
-        """Number of mappings of the set with this state mapping (or an equal one) that map ``action`` to ``source_action``.
-
-        :param state_index: row of ``state_mappings``
-        :raises ValueError: if there is no such target action
-        """
-        self._check_action(action)
-        if self.pairs is not None:
-            return len(self._matching(state_index, action, source_action))
-        equal = np.count_nonzero(self._first_equal == self._first_equal[state_index])
-        return int(equal) * self.actions.count(action, source_action)
-
     def find(self, state_index: int, action: int, source_action: int) -> int:
         """The first mapping with this state mapping (or an equal one) that maps ``action`` to ``source_action``.
 

@@ -11,12 +11,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sb3_combrel.common.periodic import differences
-
 Transition = tuple[np.ndarray, int, float, np.ndarray, bool]
 
 
-def evidence_for_action(transitions: Sequence[Transition], periodic: Sequence[bool]) -> float:
+def evidence_for_action(transitions: Sequence[Transition]) -> float:
     """By how much better ends are foretold by the action than by where it leads, in standard errors.
 
     The outcome of each instance, an end and what that pays, is foretold to be that of another one: (1) of the nearest one of
@@ -24,10 +22,9 @@ def evidence_for_action(transitions: Sequence[Transition], periodic: Sequence[bo
     error is 1 if only one of both ended; if both did, how far apart their rewards are, in parts of the range of all.
 
     :param transitions: state, action, reward, next state and terminated of each
-    :param periodic: which state variables are periodic
     """
     state, action, reward, after, ended = map(np.array, zip(*transitions, strict=True))
-    effect, number = differences(after, state, np.asarray(periodic)), np.arange(len(action))
+    effect, number = after - state, np.arange(len(action))
     by_action, expected = np.full(len(action), -1), state.copy()
     for one in np.unique(action).tolist():
         own, going_on = number[action == one], number[(action == one) & ~ended]

@@ -224,7 +224,7 @@ class GridModel(Model):
             self._set_informed()
 
     def outdated(self) -> np.ndarray:
-        return np.flatnonzero(self.pairs.n_new)
+        return np.flatnonzero(self.pairs.n_new) if self._giver is None else super().outdated()
 
     def update_rows(self, pairs: np.ndarray) -> None:
         transferred, done = tuple(self._transferred_to(pairs)), 0

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_combrel.common.checks import check_count, check_finite, count_text
+from sb3_combrel.common.observations import with_own_arrays
 from sb3_combrel.common.scaling import Bounds, StateScaling
 from sb3_combrel.sources.transitions import (
     LEARNERS,
@@ -133,7 +134,7 @@ class QLearning:
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must be between 0 and 1, got {value}")
         check_finite("initial_value", initial_value)
-        self.env = make_env(env)
+        self.env = with_own_arrays(make_env(env))
         self.observation_space, self.action_space = self.env.observation_space, self.env.action_space
         self.scaling = StateScaling.from_space(self.observation_space, bounds)
         self.n_actions = count_actions(self.action_space)

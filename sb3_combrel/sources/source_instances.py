@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from sb3_combrel.common.checks import as_count
@@ -26,7 +25,7 @@ from sb3_combrel.sources import minari_datasets, recording, replay_buffers, tabl
 from sb3_combrel.sources.q_learning import learn_q_learning
 from sb3_combrel.sources.source_checks import action_array, checked_names, finite_array, terminal_flags
 from sb3_combrel.sources.subsets import check_method, covering_rows, random_rows
-from sb3_combrel.sources.transitions import LEARNERS, Floats, as_transition_count, count_actions
+from sb3_combrel.sources.transitions import LEARNERS, Floats, as_transition_count
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -312,26 +311,6 @@ class SourceInstances:
             rows = covering_rows(units, self.actions, self.terminated, n_instances, rng, flags)
         origin = {**self.origin, "subset": {"method": method, "seed": seed, "chosen_from": len(self)}}
         return replace(self, **{name: getattr(self, name)[rows] for name in _ROW_ARRAYS}, origin=origin)
-
-    def check_spaces(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
-        """Check that the instances come from a task with these spaces.
-
-        :raises ValueError: if the numbers of variables or actions differ, or if the bounds of the variables do
-        """
-        n_actions = count_actions(action_space)
-        if observation_space.shape != (self.n_variables,) or n_actions != self.n_actions:
-            raise ValueError(
-                f"the source instances have {self.n_variables} state variables {self.state_names} and {self.n_actions} "
-                f"actions {self.action_names}, the task has {observation_space} and {action_space}; record them in this task"
-            )
-        low, high = observation_space.low, observation_space.high  # type: ignore[attr-defined]
-        bounded = np.isfinite(low) & np.isfinite(high)
-        # Spaces are often float32: compare to that precision.
-        if not (np.allclose(self.low[bounded], low[bounded]) and np.allclose(self.high[bounded], high[bounded])):
-            raise ValueError(
-                f"the source instances are of states between {self.low.tolist()} and {self.high.tolist()}, "
-                f"the task has {observation_space}; record them in this task"
-            )
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write a compressed npz file without pickled objects, complete or not at all, and return its path.

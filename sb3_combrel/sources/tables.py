@@ -54,7 +54,7 @@ def read_table(
         )
     flags = periodic_flags(periodic, len(names))
     check_periods(np.array(flags) & (bounds is None))
-    _warn_of_no_ends(frame, names)
+    _warn_of_ends(frame, names)
     steps, next_states = _with_next_states(frame, names)
     states = _numbers(steps, names)
     actions = _actions(steps, action_names)
@@ -165,8 +165,17 @@ def _with_next_states(frame: pd.DataFrame, names: Sequence[str]) -> tuple[pd.Dat
     return frame.iloc[chosen], _numbers(frame.iloc[chosen + 1], names)
 
 
-def _warn_of_no_ends(frame: pd.DataFrame, names: Sequence[str]) -> None:
-    """Warn of a table that does not say where episodes end, by columns, or by rows with an empty action."""
+def _warn_of_ends(frame: pd.DataFrame, names: Sequence[str]) -> None:
+    """Warn of a table that does not say where episodes end, by columns, or by rows with an empty action; or not why."""
+    if (
+        DONE in frame.columns
+        and not {TERMINATED, TRUNCATED}.intersection(frame.columns)
+        and (done := _flags(frame, DONE)).any()
+    ):
+        warn_user(
+            f"the table has a column {DONE!r}, but none of {TRUNCATED!r}: all {done.sum()} ends count as terminal states, "
+            "time limits as well"
+        )
     leads = any(f"{NEXT}{name}" in frame.columns for name in names)
     if {TERMINATED, DONE, TRUNCATED}.intersection(frame.columns) or (EPISODE in frame.columns and not leads):
         return
@@ -226,13 +235,7 @@ def _terminated(frame: pd.DataFrame) -> np.ndarray:
     """Whether each transition reached a terminal state: "done" counts where there is no "terminated", but for time limits."""
     if TERMINATED in frame.columns:
         return _flags(frame, TERMINATED)
-    done = _flags(frame, DONE)
-    if done.any() and TRUNCATED not in frame.columns:
-        warn_user(
-            f"the table has a column {DONE!r}, but none of {TRUNCATED!r}: all {done.sum()} ends count as terminal states, "
-            "time limits as well"
-        )
-    return done & ~_flags(frame, TRUNCATED)
+    return _flags(frame, DONE) & ~_flags(frame, TRUNCATED)
 
 
 def _actions(frame: pd.DataFrame, action_names: Sequence[str]) -> np.ndarray:

@@ -26,8 +26,7 @@ class TargetTask:
     scaling: StateScaling  #: raw <-> unit coordinates, by the bounds of the variables
     n_actions: int
     sample_states: np.ndarray  #: states that are planned with, unit coordinates, shape (n_points, n_variables)
-    #: Weight that own and transferred instances of a state-action pair must reach together. It stays where the model lowers
-    #: its own: time limits, which are evidence against a source, must not extend its reach.
+    #: Weight that own and transferred instances of a state-action pair must reach together.
     exploration_threshold: float
     min_weight: float  #: instances with less weight do not count
     min_fraction: float  #: nearest first, an instance counts while it has this fraction of the weight before it

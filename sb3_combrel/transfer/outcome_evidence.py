@@ -27,7 +27,7 @@ _N, _ERROR, _EFFECT, _WORSE = range(4)
 
 def warn_of_error(sources: Sequence[SourceInstances], n: int, error: float) -> None:
     """Warn that what was transferred predicts ``n`` transitions worse than "no change", by ``error`` times."""
-    names = ", ".join(str(source.origin.get("env", source)) for source in sources)
+    names = ", ".join(str(source.origin.get("env") or "an unnamed task") for source in sources)
     warn_user(
         f"what was transferred from {names} predicts the target worse than that nothing changes: on {n} "
         f"transitions its mean squared error is {error:.2f} times as large; try another mapping or source",
@@ -87,6 +87,10 @@ class OutcomeEvidence:
         """Take in the end of an episode; ``truncated``: by its time limit."""
         if truncated:
             self._leave()
+
+    def break_off(self) -> None:
+        """Forget the visits that were going on."""
+        self._visits.clear()
 
     def _leave(self) -> None:
         self.absent += 0 < self.steps_of_visit < STEPS_OF_A_VISIT

@@ -74,7 +74,7 @@ class EvidencePoint:
     """What a source was worth at one time of learning, with ``use="prior"``; it holds until the next point."""
 
     step: int  #: steps of the target that were observed by then
-    error: float  #: mean squared error of the mapping in use over that of "no change", on all steps until then
+    error: float  #: mean squared error of the mapping in use over that of "no change", on the steps compared until then
     exceeded: float  #: by how much returns had exceeded the source's values
     bounds_values: bool  #: whether the source's values bounded what is unknown
     strengths: tuple[float, ...]  #: by target action: as how many of the target's own instances the source counted
@@ -121,6 +121,8 @@ class TransferReport:
             return "The model has no transfer method: what it knows is its own."
         if self.says_nothing:
             return NO_MAPPING
+        if not self.mappings and not self.n_compared:
+            return "The method does not say how well the source explains the target; its figures may."
         if not self.n_compared or np.isnan(self.error):
             return "Nothing can be said of the source: none of its predictions has been compared with what happened."
         well = "well" if self.error < 0.5 else "in part" if self.error < 1.0 else "no better than that nothing changes"

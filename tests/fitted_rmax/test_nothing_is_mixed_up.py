@@ -7,7 +7,7 @@ from helpers.agents import make_agent
 from helpers.walk import Walk, small, walk_source
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_combrel import COMBREL, TIMBREL, FittedRMax, SourceInstances
+from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping, SourceInstances, SparseCodingMapping
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.transfer.methods.experts import MappingExperts
 
@@ -156,3 +156,95 @@ def test_rewards_too_small_for_the_plan_are_named():
 
     with pytest.warns(UserWarning, match=r"no reward so far is larger than 1e-05.*pass planning_tolerance=1e-08"):
         small(Tiny(limit=10)).learn(200)
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_what_is_transferred_stays_when_all_is_computed_anew(degree):
+    transfer = TIMBREL(walk_source(), InterTaskMapping([0, 1], [0, 1]))
+    agent = small(degree=degree, transfer=transfer).learn(40).agent
+    before = agent.mdp.arrays.modelled & ~agent.model.known
+    agent.rescale(agent.task.scaling, agent.task.shared_scaling)
+    after = agent.mdp.arrays.modelled & ~agent.model.known
+    assert before.sum() > 100 and (after[before] | agent.model.known[before]).all()
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_a_model_that_is_saved_before_its_first_step_learns_as_it_would_have(degree, tmp_path):
+    models = [small(degree=degree, transfer=TIMBREL(walk_source(), InterTaskMapping([0, 1], [0, 1]))) for _ in range(2)]
+    models[1].save(tmp_path / "model")
+    models[1] = FittedRMax.load(tmp_path / "model", env=Walk())
+    for model in models:
+        model.get_env().seed(0)
+        model.learn(20)
+    modelled = [model.agent.mdp.arrays.modelled for model in models]
+    assert modelled[0].mean() > 0.5
+    np.testing.assert_array_equal(*modelled)
+
+
+def test_an_episode_that_an_expert_has_begun_goes_on_when_all_is_computed_anew():
+    agent = small(transfer=MappingExperts(walk_source(), max_experts=2)).agent
+    states = np.array([[0.3, 0.5], [0.6, 0.5]])
+    for environment in (0, 1):
+        agent.act(states[environment], environment=environment)
+    agent.update(states[0], 0, -1.0, states[0], False, 0)
+    agent.rescale(agent.task.scaling, agent.task.shared_scaling)
+    agent.update(states[1], 1, -3.0, states[1], True, 1)
+    agent.end_episode(False, 1)
+    assert [each.total for each in agent.transfer._ended] == [-3.0]
+
+
+def test_a_visit_that_a_reset_breaks_off_is_no_end_that_did_not_come():
+    agent = small(transfer=TIMBREL(walk_source(), InterTaskMapping([0, 1], [0, 1]))).agent
+    evidence = agent.transfer._instances.check.evidence
+    evidence.note((1.0, -1.0), -1.0, False)
+    assert evidence.steps_of_visit == 1
+    agent.break_off()
+    evidence.note((0.0, -1.0), -1.0, False)
+    assert evidence.absent == 0 and evidence.steps_of_visit == 0
+
+
+def test_a_learned_translation_hears_of_which_environment_a_transition_is():
+    agent = small(transfer=SparseCodingMapping(walk_source(), n_random_steps=20)).agent
+    rng = np.random.default_rng(0)
+    for i in range(30):
+        state = rng.random(2)
+        agent.update(state, i % 2, -1.0, state, False, i % 3)
+        if agent.transfer._timbrel is not None and i >= 20:
+            assert agent.transfer._timbrel.environment == i % 3
+    assert agent.transfer._timbrel is not None
+
+
+class OneArray(Walk):
+    """Returns the same array at each step, as some simulators do."""
+
+    def observe(self):
+        if not hasattr(self, "array"):
+            self.array = np.zeros(2, dtype=np.float32)
+        self.array[:] = super().observe()
+        return self.array
+
+
+def test_q_learning_records_where_it_was_and_not_where_it_is_now():
+    found = [SourceInstances.from_q_learning(env, 100, seed=0, total_timesteps=300) for env in (OneArray(), Walk())]
+    assert len(np.unique(found[0].states[:, 0])) > 10
+    np.testing.assert_array_equal(found[0].states, found[1].states)
+    np.testing.assert_array_equal(found[0].next_states, found[1].next_states)
+
+
+class Named(Walk):
+    state_names, action_names = ["place", "height"], ["left", "right"]
+
+
+class Swapped(Walk):
+    state_names, action_names = ["height", "place"], ["left", "right"]
+
+
+def test_an_environment_with_its_variables_in_another_order_is_another_one(tmp_path):
+    model = small(Named())
+    with pytest.raises(ValueError, match=r"env must have the state_names of the model, \['place', 'height'\], got \['height'"):
+        model.set_env(Swapped())
+    assert model.get_env().get_attr("state_names") == [["place", "height"]]
+    model.set_env(Walk())
+    model.save(tmp_path / "model")
+    with pytest.raises(ValueError, match="is a model of another task than env: env must have the state_names"):
+        FittedRMax.load(tmp_path / "model", env=Swapped())

@@ -10,7 +10,6 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_combrel import FittedRMax
-from sb3_combrel.common.periodic import differences
 from sb3_combrel.models.ends_by_action import evidence_for_action
 
 
@@ -115,7 +114,7 @@ def test_an_interrupt_while_all_is_computed_anew_leaves_all_as_it_was(monkeypatc
     assert not by_action(model) and agent._ends_due == due
 
 
-def evidence_in_loops(transitions, periodic):
+def evidence_in_loops(transitions):
     """The same from its definition."""
     rewards = [reward for _, _, reward, _, _ in transitions]
     better = []
@@ -127,11 +126,11 @@ def evidence_in_loops(transitions, periodic):
         going_on = [j for j in same if not transitions[j][4]]
         if going_on:
             s, _, _, n, _ = transitions[min(going_on, key=lambda j: np.linalg.norm(transitions[j][0] - state))]
-            expected = state + differences(n, s, np.array(periodic))
+            expected = state + n - s
         others = [j for j in range(len(transitions)) if j != i]
 
         def arrival(j):
-            return transitions[j][0] + differences(transitions[j][3], transitions[j][0], np.array(periodic))
+            return transitions[j][3]
 
         errors = []
         for j in (
@@ -150,9 +149,13 @@ def evidence_in_loops(transitions, periodic):
 @given(st.integers(0, 10**6), st.integers(1, 3), st.integers(2, 60), st.floats(0.0, 1.0))
 def test_the_evidence_is_that_of_its_definition(seed, n_actions, n, share):
     rng = np.random.default_rng(seed)
-    periodic = (True, False)
     transitions = [
         (rng.random(2), int(rng.integers(n_actions)), float(rng.normal()), rng.random(2), bool(rng.random() < share))
         for _ in range(n)
     ]
-    np.testing.assert_allclose(evidence_for_action(transitions, periodic), evidence_in_loops(transitions, periodic), atol=1e-9)
+    np.testing.assert_allclose(evidence_for_action(transitions), evidence_in_loops(transitions), atol=1e-9)
+
+
+def test_it_is_noticed_although_few_instances_are_kept():
+    model = FittedRMax(CONTEXT, seed=0, max_instances=20).learn(400)
+    assert model.agent.model.n_instances == 40 and by_action(model)

@@ -31,7 +31,6 @@ def check_against_members(mapping_set, n_source_actions):
         for s, row in enumerate(rows):
             for b in range(n_source_actions):
                 matching = [i for i, mapping in enumerate(members) if key[i] == row and mapping.action[a] == b]
-                assert mapping_set.count(s, a, b) == len(matching)
                 if matching:
                     assert mapping_set.find(s, a, b) == matching[0]
                 else:

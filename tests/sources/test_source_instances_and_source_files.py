@@ -3,11 +3,10 @@
 import io
 import json
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from helpers.sources import Corridor, assert_same, some_source
+from helpers.sources import assert_same, some_source
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -54,17 +53,6 @@ class TestSourceInstances:
     def test_wrong_arguments_are_named(self, changes, message):
         with pytest.raises(ValueError, match=message):
             SourceInstances(**arguments(**changes))
-
-    def test_the_task_of_a_source_can_be_checked(self):
-        source = SourceInstances.record(None, "MountainCar-v0", 5, seed=0)
-        task = gym.make("MountainCar-v0")
-        source.check_spaces(task.observation_space, task.action_space)
-        with pytest.raises(ValueError, match="record them in this task"):
-            source.check_spaces(Corridor.observation_space, Corridor.action_space)
-        with pytest.raises(ValueError, match=r"states between \[-1.2"):
-            source.check_spaces(gym.spaces.Box(0, 1, (2,)), task.action_space)
-        with pytest.raises(ValueError, match="action space must be Discrete"):
-            source.check_spaces(task.observation_space, gym.spaces.Box(0, 1, (1,)))
 
 
 class TestSubset:

@@ -92,6 +92,9 @@ class InstanceTransfer:
             if self._by_relevance and n_used >= max(MIN_TRANSITIONS_FOR_RELEVANCE, RELEVANCE_GROWTH * self._n_of_relevance):
                 self._renew_relevance(n_used)
 
+    def break_off(self) -> None:
+        self.check.break_off()
+
     def end_episode(self, truncated: bool) -> None:
         """Narrow the kernel if the target has contradicted what was transferred: else nothing would ever be explored."""
         self.check.evidence.environment = self.environment
@@ -204,5 +207,6 @@ class InstanceTransfer:
             n = min(int(state["relevance_of"][0]), self.selector.n_used())
             if n > 0:
                 self._renew_relevance(n)
-        # All pairs of the sample are asked for again with what is restored here.
-        self.all_changed = False
+        if self.n_observed > 0:
+            # All pairs of the sample are asked for again with what is restored here.
+            self.all_changed = False

@@ -74,6 +74,11 @@ class InstancesCheck:
         self.evidence.note((end, predicted_reward), reward, terminated)
         return predicted
 
+    def break_off(self) -> None:
+        """Forget what was going on."""
+        self._pending.clear()
+        self.evidence.break_off()
+
     def end_episode(self, truncated: bool) -> bool:
         """Take in the end of an episode; return whether what was transferred has been contradicted, see the class."""
         self.evidence.end_episode(truncated)

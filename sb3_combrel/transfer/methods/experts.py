@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, astuple, dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -36,6 +36,7 @@ class Episode:
     steps: int = 0
     acted: int = 0
     asked: bool = False  # for an action, whose transition has not come yet: others are past data
+    own: bool = False  # whether the last transition was the answer to that
 
 
 @dataclass(repr=False, eq=False)
@@ -121,7 +122,6 @@ class MappingExperts(Transfer):
         self.experts: list[Expert] = []
         self._ended: list[Episode] = []
         self._playing: dict[int, Episode] = {}  # by number of the environment
-        self._own = False  # whether the last transition was of an episode of its own
 
     def action(self, state: np.ndarray) -> int | None:
         playing = self._playing.get(self.environment)
@@ -173,14 +173,15 @@ class MappingExperts(Transfer):
 
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         playing = self._playing.get(self.environment)
-        self._own = playing is not None and playing.asked
-        if playing is not None and self._own:
-            playing.asked = False
+        if playing is None:
+            return
+        playing.own, playing.asked = playing.asked, False
+        if playing.own:
             playing.total += reward
             playing.steps += 1
 
     def end_episode(self, truncated: bool) -> None:
-        if self._own and self.environment in self._playing:
+        if self.environment in self._playing and self._playing[self.environment].own:
             self._ended.append(self._playing.pop(self.environment))
 
     def break_off(self) -> None:
@@ -226,11 +227,11 @@ class MappingExperts(Transfer):
 
     def get_state(self) -> dict[str, np.ndarray]:
         episodes = [(each.arm, each.total, each.steps, each.acted) for each in self._ended]
-        playing = [(number, one.arm, one.total, one.steps, one.acted) for number, one in self._playing.items()]
+        playing = [(number, *astuple(one)) for number, one in self._playing.items()]
         return {
             "experts": self._numbers[:, None].astype(np.float64),
             "episodes": np.array(episodes, dtype=np.float64).reshape(-1, 4),
-            "playing": np.array(playing, dtype=np.float64).reshape(-1, 5),
+            "playing": np.array(playing, dtype=np.float64).reshape(-1, 7),
         }
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
@@ -238,8 +239,8 @@ class MappingExperts(Transfer):
         self._ended, self._playing = [], {}
         for arm, total, steps, acted in state["episodes"].tolist():
             self._ended.append(Episode(int(arm), total, int(steps), int(acted)))
-        for environment, arm, total, steps, acted in state["playing"].tolist():
-            self._playing[int(environment)] = Episode(int(arm), total, int(steps), int(acted))
+        for environment, arm, total, steps, acted, asked, own in state["playing"].tolist():
+            self._playing[int(environment)] = Episode(int(arm), total, int(steps), int(acted), bool(asked), bool(own))
 
 
 def mean_return(arm: int, returns: list[float]) -> float:

@@ -122,6 +122,7 @@ class LearnedTranslation(Transfer):
 
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         if self._timbrel is not None:
+            self._timbrel.environment = self.environment
             self._timbrel.observe(state, action, reward, next_state, terminated)
             return
         self._samples = np.vstack([self._samples, [*state, action, *(next_state - state)]])
@@ -169,7 +170,12 @@ class LearnedTranslation(Transfer):
 
     def end_episode(self, truncated: bool) -> None:
         if self._timbrel is not None:
+            self._timbrel.environment = self.environment
             self._timbrel.end_episode(truncated)
+
+    def break_off(self) -> None:
+        if self._timbrel is not None:
+            self._timbrel.break_off()
 
     def note_use(self, transferred: TransferredInstances) -> None:
         if self._timbrel is not None:

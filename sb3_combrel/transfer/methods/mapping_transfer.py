@@ -229,6 +229,9 @@ class MappingTransfer(Transfer):
         self._source_use.environment = self.environment
         self._source_use.end_episode(truncated)
 
+    def break_off(self) -> None:
+        self._source_use.break_off()
+
     def note_use(self, transferred: TransferredInstances) -> None:
         if self.use == "instances":
             self._instances.note_use(transferred)

@@ -124,9 +124,13 @@ class MASTER(MappingTransfer):
 
 
 def squared_errors(copies: Copies, sums: CopySums) -> np.ndarray:
-    """Return effects' squared errors, summed, unit coordinates, shape (n_copies, n_target_actions, most source actions)."""
+    """Return effects' squared errors, summed, unit coordinates, shape (n_copies, n_target_actions, most source actions).
+
+    They are infinite for source actions that no instance has taken.
+    """
     left_out = (copies.state < 0).astype(np.float64)
-    return np.asarray(sums.error.sum(axis=3) + (left_out @ sums.effect.T)[:, :, None])
+    errors = sums.error.sum(axis=3) + (left_out @ sums.effect.T)[:, :, None]
+    return np.where(copies.taken[:, None], errors, np.inf)
 
 
 def least_error_member(errors: np.ndarray, mappings: MappingSet) -> tuple[float, int, np.ndarray]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import KW_ONLY, dataclass, field
 
 import numpy as np
@@ -143,10 +142,6 @@ class SampleTransfer(MappingTransfer):
         actions = np.array(mapping.action) + self.candidates.first_action[source]
         sums = self._tasks.sums[row, np.arange(len(actions)), actions]
         return float(sums.sum() / max(self._tasks.transitions.n, 1))
-
-    def drawn_counts(self) -> list[tuple[str, int]]:
-        """Return how many of the instances in use were drawn through each candidate, the most first, by name."""
-        return [(self.describe(candidate), n) for candidate, n in Counter(self.drawn[:, 0].tolist()).most_common()]
 
     def mapping_steps(self) -> int:
         """Return after how many transitions of the target instances were first drawn; all so far if none have been."""

@@ -91,17 +91,18 @@ class PriorCandidates:
     def describe_copies(self, choice: Choice) -> str:
         """Name the copies of a choice: "(x, vx) and (y, vy)", or "no copy at all"."""
         copies = dict.fromkeys(choice.copies[choice.copies >= 0].tolist())
-        return " and ".join(describe_copy(self.mapping(each)) for each in copies) or "no copy at all"
+        return " and ".join(describe_copy(self.mapping(each)) + self._of_source(each) for each in copies) or "no copy at all"
 
     def mapping(self, copy: int) -> InterTaskMapping:
         """Return a copy as an inter-task mapping, with names, of which the states alone count."""
         return self.copies.mapping(copy, self.task, (0,) * self.task.n_actions)
 
     def _action_name(self, copy: int, used: int) -> str:
-        """The name of a source action, and of several sources the number of the source, from 1 on."""
-        number = int(self.copies.source[copy])
-        name = self.copies.sources[number].action_names[used]
-        return name if len(self.copies.sources) == 1 else f"{name} of source {number + 1}"
+        return self.copies.sources[int(self.copies.source[copy])].action_names[used] + self._of_source(copy)
+
+    def _of_source(self, copy: int) -> str:
+        """Of several sources the number of a copy's, from 1 on."""
+        return "" if len(self.copies.sources) == 1 else f" of source {int(self.copies.source[copy]) + 1}"
 
     def get_state(self) -> np.ndarray:
         """Return all candidates and their uses, one a row, float64, shape (n, 2 * n_variables + 2)."""

@@ -203,6 +203,9 @@ class SourcePrior:
         chosen = bool((self.bounding.actions[self.bounding.copies >= 0] >= 0).all())
         return chosen and bool((found >= 0.0).all()) and self.evidence.explains_rewards()
 
+    def break_off(self) -> None:
+        self._episodes.clear()
+
     def end_episode(self, truncated: bool) -> None:
         version = self.version
         if self.evidence.has_changed():
@@ -284,7 +287,7 @@ class SourcePrior:
                 yield a, copy, used, self.copies.state[copy] >= 0
 
     def error(self) -> float:
-        """Return the mean squared error of the mapping in use over that of "no change", on all steps; NaN if none moved."""
+        """Return the mean squared error of the mapping in use over that of "no change", on the steps compared; NaN without."""
         baseline = float(self.sums.effect.sum())
         errors = self.sums.effect.copy()
         for a, copy, used, has in self._moves():
