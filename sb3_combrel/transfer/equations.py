@@ -384,6 +384,17 @@ def ends_evidence(ended: Bools, foretold: Floats) -> float:
     return float(np.log(np.where(ended, foretold, 1.0 - foretold)).sum())
 
 
+def rewards_evidence(rewards: Floats, foretold: Floats, weights: Floats) -> float:
+    """Compute the logarithm of how probable rewards were, up to a constant, under Student's t with one degree of freedom.
+
+    Its scale is the mean size of the rewards, so that other rewards are told apart, and small differences are not.
+
+    :param rewards: of t transitions, shape (t,); ``foretold``: by a source; ``weights``: of its data there, the same
+    """
+    errors = (rewards - foretold) / max(float(np.abs(rewards).mean()), 1e-9)
+    return float(-(weights / (1.0 + weights) * np.log1p(errors**2)).sum())
+
+
 def division_evidence(of_copies: Sequence[Floats], actions: Ints, n_source_actions: Sequence[int], n_copies: int) -> float:
     """Compute the evidence for a division of the target's variables into copies of the source, against "all of them stay".
 

@@ -1,5 +1,7 @@
 """Which of a copy and its mirror images bounds values: on a line whose effects are their own mirror image."""
 
+from dataclasses import replace
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from sb3_combrel.transfer import equations
 from sb3_combrel.transfer.prior import prior_choice
 from sb3_combrel.transfer.prior.copies import Copies
 from sb3_combrel.transfer.prior.copy_sums import CopySums
-from sb3_combrel.transfer.prior.image_ends import best_ending
+from sb3_combrel.transfer.prior.image_ends import best_ending, best_source
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
 STEP, GOAL = 0.05, 0.9
@@ -162,3 +164,45 @@ def test_values_are_bounded_from_the_side_where_the_target_ends_and_so_after_loa
     loaded = FittedRMax.load(tmp_path / "model").transfer.source_prior
     assert loaded.bounding.same(prior.bounding)
     np.testing.assert_array_equal(loaded.value_bound(), bound)
+
+
+@given(st.lists(st.tuples(st.floats(-5.0, 5.0), st.floats(-5.0, 5.0), st.floats(0.0, 30.0)), min_size=1, max_size=20))
+def test_the_evidence_of_rewards_is_that_of_student_s_t_with_the_mean_size_as_scale(transitions):
+    rewards, foretold, weights = map(np.array, zip(*transitions, strict=True))
+    size = max(sum(abs(r) for r in rewards.tolist()) / len(rewards), 1e-9)
+    expected = sum(-w / (w + 1.0) * np.log(1.0 + ((r - f) / size) ** 2) for r, f, w in transitions)
+    assert equations.rewards_evidence(rewards, foretold, weights) == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+WRONG = {
+    "rewards": lambda right: replace(right, rewards=-right.rewards),
+    "ends": lambda right: replace(right, terminated=right.next_states[:, 0] < 0.5),
+}
+
+
+@pytest.mark.parametrize("right_first", [True, False])
+@pytest.mark.parametrize("d", [1, 2])
+@pytest.mark.parametrize("wrong", WRONG)
+def test_of_sources_with_the_same_effects_that_with_the_target_s_ends_and_rewards_is_taken(wrong, d, right_first):
+    sources = [line_source(), WRONG[wrong](line_source())][:: 1 if right_first else -1]
+    transitions = seen(d, lambda x: (x > GOAL).all())
+    state = np.tile(np.where(np.eye(d) > 0, 0, -1), (2, 1))
+    copies = Copies(sources, np.repeat([0, 1], d), state, np.ones((2 * d, d)), 0.2)
+    sums = CopySums.zero(2 * d, 2, 2**d, d)
+    for i in range(transitions.n):
+        copies.measure(transitions.states[i], int(transitions.actions[i]), transitions.effects[i], sums)
+    choice = prior_choice.choose_factored(copies, sums)
+    assert choice.copies[0].tolist() == list(range(d)), "by effects, the first of equals"
+    found = best_source(copies, sums, choice, transitions)
+    assert set(copies.source[found.copies.ravel()]) == {0 if right_first else 1}
+    np.testing.assert_array_equal(found.actions, choice.actions)
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_a_learner_goes_over_to_the_source_with_the_right_rewards_and_ends(wrong):
+    sources = [WRONG[wrong](line_source()), line_source()]
+    model = FittedRMax(gym.wrappers.TimeLimit(Line(True), 100), transfer=COMBREL(sources), seed=0).learn(300)
+    prior = model.transfer.source_prior
+    assert set(prior.copies.source[prior.choice.copies[prior.choice.copies >= 0]]) == {1}
+    assert prior.evidence.explains_rewards() and prior.value_bound() is not None
+    assert "of source 2" in model.transfer.describe_prior()

@@ -70,11 +70,19 @@ class PriorEvidence:
             pull = STRENGTHS * part * own[1]
             errors = error[:, None] - pull / (1.0 + pull) * (predicted - own[0])[:, None]
             self.likelihood[action] -= np.log1p(errors * errors / squared_scale)
-        reward, expected = rewards
+        self._note_reward(*rewards, part)
+
+    def _note_reward(self, reward: float, expected: float, part: float) -> None:
         n, total = self._rewards.tolist()
         if n > 0.0:
             self.reward_errors += part * abs(reward - expected), part * abs(reward - total / n)
         self._rewards += 1.0, reward
+
+    def note_rewards_anew(self, rewards: np.ndarray, expected: np.ndarray, weights: np.ndarray) -> None:
+        """Forget the rewards so far, and take in those of all transitions: another source predicts others; shape (n,) each."""
+        self.reward_errors[:], self._rewards[:] = 0.0, 0.0
+        for reward, of_source, weight in zip(rewards.tolist(), expected.tolist(), weights.tolist(), strict=True):
+            self._note_reward(reward, of_source, weight / (1.0 + weight))
 
     def strength_of_actions(self, of: np.ndarray) -> np.ndarray:
         """The geometric mean of :attr:`strength` over variables, shape (n_actions,); NaN without any.

@@ -129,6 +129,19 @@ def images_of(copies: Copies, scores: np.ndarray, copy: int) -> list[int]:
     return np.flatnonzero(images & (TELLS_APART * scores > scores[copy])).tolist()
 
 
+def twins_of(copies: Copies, scores: np.ndarray, copy: int) -> list[int]:
+    """Find the best copy of each other source that the effects' evidence does not tell apart from a copy.
+
+    :param scores: :func:`scores_of`
+    """
+    same = ((copies.state >= 0) == (copies.state[copy] >= 0)).all(axis=1) & (TELLS_APART * scores > scores[copy])
+    found = []
+    for source in np.setdiff1d(copies.source[same], copies.source[copy]).tolist():
+        of_source = np.flatnonzero(same & (copies.source == source))
+        found.append(int(of_source[scores[of_source].argmax()]))
+    return found
+
+
 def variables_of(members: np.ndarray) -> np.ndarray:
     """A number for the set of variables of each copy, int64; ``members``: bool, shape (n_copies, n_variables)."""
     return np.asarray(members @ (1 << np.arange(members.shape[1])))

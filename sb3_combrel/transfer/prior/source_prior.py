@@ -14,7 +14,7 @@ from sb3_combrel.transfer.outcome_evidence import TRANSITIONS_BEFORE_WARNING, Re
 from sb3_combrel.transfer.prior.copies import MANY, Copies, Predicted
 from sb3_combrel.transfer.prior.copy_sums import CopySums
 from sb3_combrel.transfer.prior.evidence import FIRST_RENEWAL, RENEWAL_GROWTH, OwnPrediction, PriorEvidence
-from sb3_combrel.transfer.prior.image_ends import best_ending
+from sb3_combrel.transfer.prior.image_ends import best_ending, best_source
 from sb3_combrel.transfer.prior.prior_candidates import PriorCandidates
 from sb3_combrel.transfer.prior.prior_choice import Choice, Chooser, choose_whole, whole_part
 from sb3_combrel.transfer.prior.prior_history import PriorHistory
@@ -224,7 +224,7 @@ class SourcePrior:
 
     def _renew(self, choose: bool) -> None:
         if choose and self.choose is not None:
-            choice = self.choose(self.sums)
+            choice = self._of_best_source(self.choose(self.sums))
             if not choice.same(self.choice):
                 self.n_switches += self.choice is not None
                 self.set_choice(choice)
@@ -246,10 +246,16 @@ class SourcePrior:
             return
         choice = self.choice
         whole = whole_part(self.copies, choice) if self.whole else choose_whole(self.copies, self.sums, choice)
+        whole = self._of_best_source(whole)
         bounding = best_ending(self.copies, self.sums, whole, self.transitions)
         if not bounding.same(self.bounding):
             self.bounding, self.excess, self.version = bounding, 0.0, self.version + 1
             self.explains = self._explains()
+
+    def _of_best_source(self, choice: Choice) -> Choice:
+        """The same, but through other sources where they foretell rewards and ends better."""
+        several = len(self.copies.sources) > 1
+        return best_source(self.copies, self.sums, choice, self.transitions) if several else choice
 
     def set_choice(self, choice: Choice) -> None:
         """Predict through these copies from now on."""
@@ -261,7 +267,9 @@ class SourcePrior:
         """Count anew what confirms and contradicts what is predicted through another mapping."""
         self.errors.sums[:] = 0.0
         n, seen = self.transitions.n, self.transitions
-        effect, _, weight = self._raw(seen.states[:n].copy(), seen.actions[:n].copy())
+        effect, expected, weight = self._raw(seen.states[:n].copy(), seen.actions[:n].copy())
+        if len(self.copies.sources) > 1:
+            self.evidence.note_rewards_anew(seen.rewards[:n], expected, weight)
         for i in range(n):
             self._compare(seen.states[i], int(seen.actions[i]), seen.effects[i], effect[i], float(weight[i]))
 
