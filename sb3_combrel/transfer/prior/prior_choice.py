@@ -132,9 +132,12 @@ def images_of(copies: Copies, scores: np.ndarray, copy: int) -> list[int]:
 def twins_of(copies: Copies, scores: np.ndarray, copy: int) -> list[int]:
     """Find the best copy of each other source that the effects' evidence does not tell apart from a copy.
 
+    One that has all variables of its source is told apart from parts of others.
+
     :param scores: :func:`scores_of`
     """
     same = ((copies.state >= 0) == (copies.state[copy] >= 0)).all(axis=1) & (TELLS_APART * scores > scores[copy])
+    same &= copies.whole | ~copies.whole[copy]
     found = []
     for source in np.setdiff1d(copies.source[same], copies.source[copy]).tolist():
         of_source = np.flatnonzero(same & (copies.source == source))
