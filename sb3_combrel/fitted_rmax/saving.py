@@ -210,7 +210,7 @@ def _naming(path: object, changed: Sequence[str] = ()) -> Iterator[None]:
     except Exception as error:
         version, policy = _origin(path)
         # A policy may be one of the user's own.
-        if version == BEFORE and not policy.startswith(f"{__name__.partition('.')[0]}."):
+        if version == BEFORE and policy and not policy.startswith(f"{__name__.partition('.')[0]}."):
             raise ValueError(f"{path} is a model of another algorithm, of {policy}: load it with its own class") from error
         if "spaces do not match" in str(error) or str(error).startswith("env must have"):
             raise ValueError(f"{path} is a model of another task than env: {error}") from error
