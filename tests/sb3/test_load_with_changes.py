@@ -6,6 +6,7 @@ from helpers.walk import Walk, small, walk_source
 from stable_baselines3 import DQN
 
 from sb3_combrel import COMBREL, FittedRMax
+from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 
 
 @pytest.fixture
@@ -67,3 +68,13 @@ def test_a_model_of_another_algorithm_is_named_without_its_suffix(tmp_path):
 
 def test_the_file_of_a_model_is_found_without_its_suffix(file):
     assert small().load_instances(file).agent.model.n_instances == 200
+
+
+class OwnPolicy(FittedRMaxPolicy):
+    """A policy of a user's own."""
+
+
+def test_a_policy_of_ones_own_does_not_hide_what_is_wrong(tmp_path):
+    FittedRMax(OwnPolicy, Walk(), seed=0).save(tmp_path / "model")
+    with pytest.raises(ValueError, match="is a model of another task than env: Observation spaces do not match"):
+        FittedRMax.load(tmp_path / "model", env="CartPole-v1")
