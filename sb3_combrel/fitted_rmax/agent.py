@@ -35,7 +35,7 @@ from sb3_combrel.fitted_rmax.optimism import RewardRange, worth_after_visits
 from sb3_combrel.fitted_rmax.promises import Promises
 from sb3_combrel.fitted_rmax.settings import MODELS, FittedRMaxSettings
 from sb3_combrel.fitted_rmax.workload import warn_if_long, workload
-from sb3_combrel.models.base import NO_PAIRS, Model
+from sb3_combrel.models.base import NO_PAIRS, Model, Transition
 from sb3_combrel.models.ends_by_action import evidence_for_action
 from sb3_combrel.planning.grid import fitting_grid
 from sb3_combrel.planning.lines import moved_lines
@@ -44,8 +44,6 @@ from sb3_combrel.planning.planner import Planner
 from sb3_combrel.planning.q_values import Prediction, QValues, ValueFunction
 from sb3_combrel.transfer.base import TargetTask, Transfer
 
-# State, action, reward, next state, terminated.
-Transition = tuple[np.ndarray, int, float, np.ndarray, bool]
 # By what the names of arrays of a transfer method begin in the agent's state.
 OF_TRANSFER = "transfer_"
 
@@ -444,11 +442,7 @@ class FittedRMaxAgent:
         self._ends_due = 2 * self.rewards.n_ended
 
     def rescale(
-        self,
-        scaling: StateScaling,
-        bounds: StateScaling,
-        lines: np.ndarray | None = None,
-        ends_by_action: bool | None = None,
+        self, scaling: StateScaling, bounds: StateScaling, lines: np.ndarray | None = None, ends_by_action: bool | None = None
     ) -> None:
         """Compute all anew in other unit coordinates; an interrupt, or an error, leaves all as it was.
 

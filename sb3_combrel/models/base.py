@@ -14,6 +14,8 @@ from sb3_combrel.planning.mdp import FiniteMDP
 from sb3_combrel.planning.q_values import Prediction
 
 NO_PAIRS = np.empty(0, dtype=np.int64)
+# State, action, reward, next state, terminated.
+Transition = tuple[np.ndarray, int, float, np.ndarray, bool]
 MAX_PAIRS_AT_ONCE = 4096
 
 
@@ -144,7 +146,7 @@ class Model(ABC):
         """All pairs whose rows are not what the instances say: for new scales."""
         return np.arange(len(self.known))
 
-    def transitions(self) -> list[tuple[np.ndarray, int, float, np.ndarray, bool]]:
+    def transitions(self) -> list[Transition]:
         """State, action, reward, next state and terminated of all instances, in the order in which they came."""
         rows, d = self.instances.rows()[np.argsort(self._numbers(), kind="stable")], self.grid.n_variables
         states, next_states = rows[:, 1 : 1 + d], rows[:, 1 : 1 + d] + rows[:, 1 + d : 1 + 2 * d]

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-Transition = tuple[np.ndarray, int, float, np.ndarray, bool]
+from sb3_combrel.models.base import Transition
 
 
 def evidence_for_action(transitions: Sequence[Transition]) -> float:
@@ -19,7 +19,8 @@ def evidence_for_action(transitions: Sequence[Transition]) -> float:
 
     The outcome of each instance, an end and what that pays, is foretold to be that of another one: (1) of the nearest one of
     the same action; (2) of the one that arrived nearest to where the effect of the nearest one that went on would lead. The
-    error is 1 if only one of both ended; if both did, how far apart their rewards are, in parts of the range of all.
+    error is 1 if only one of both ended; if both did, how far apart their rewards are, in parts of the range of all. Distances
+    do not wrap.
 
     :param transitions: state, action, reward, next state and terminated of each
     """

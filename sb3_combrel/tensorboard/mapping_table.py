@@ -31,14 +31,15 @@ def mapping_table(transfer: MappingTransfer, action_names: Sequence[str]) -> str
     rows = [*ranked[:ROWS], *([("Others", rest)] if rest else []), ("Total", by_action)]
     lines = [
         f"{len(shares)} mappings in {by_action.total():,} uses. Each column: per cent of that target action's transfers.\n",
-        "| source action and state mapping | " + " | ".join(map(_escaped, [*action_names, "All"])) + " |",
+        "| source action and state mapping | " + " | ".join(map(escaped, [*action_names, "All"])) + " |",
         "| --- |" + " ---: |" * (len(action_names) + 1),
     ]
-    lines += [f"| {_escaped(name)} | {' | '.join(_row(counts, by_action, len(action_names)))} |" for name, counts in rows]
+    lines += [f"| {escaped(name)} | {' | '.join(_row(counts, by_action, len(action_names)))} |" for name, counts in rows]
     return "\n".join([*lines, "", _commonest(transfer, uses, action_names)])
 
 
-def _escaped(name: str) -> str:
+def escaped(name: str) -> str:
+    """A name as a cell of a Markdown table."""
     return name.replace("|", "\\|")
 
 

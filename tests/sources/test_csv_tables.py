@@ -73,8 +73,9 @@ def test_done_is_an_end_but_for_time_limits():
 
 def test_done_without_truncated_may_be_a_time_limit():
     frame = pd.DataFrame(STEPS).drop(columns="terminated").assign(done=[0, 0, 1, 0, 1])
-    with pytest.warns(UserWarning, match="all 2 ends count as terminal states, time limits as well"):
+    with pytest.warns(UserWarning, match="all 2 ends count as terminal states, time limits as well") as caught:
         SourceInstances.from_table(frame)
+    assert len(caught) == 1
 
 
 def test_the_index_that_pandas_writes_is_no_state_variable(tmp_path):

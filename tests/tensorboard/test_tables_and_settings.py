@@ -8,7 +8,7 @@ from helpers.dashboard import events, run_folder, walker
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import plugin_data_pb2
 
-from sb3_combrel.tensorboard.mapping_table import mapping_table
+from sb3_combrel.tensorboard.mapping_table import escaped, mapping_table
 from sb3_combrel.tensorboard.summaries import LAYOUT
 
 
@@ -32,6 +32,10 @@ def test_the_table_of_mappings_counts_uses(learnt):
 
 def test_the_table_of_a_method_that_transferred_nothing_is_a_sentence(transfers):
     assert "No step" in mapping_table(walker(transfer=transfers["COMBREL"]).policy.transfer, ("back", "forth"))
+
+
+def test_names_with_bars_do_not_break_the_table():
+    assert escaped("a|b") == r"a\|b"
 
 
 def test_settings_are_in_the_hparams_tab(transfers, tmp_path):

@@ -16,6 +16,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from sb3_combrel import MASTER, TIMBREL, InterTaskMapping, MappingExperts, MappingSet, SourceInstances
 from sb3_combrel.transfer.candidates import stacked_instances
 from sb3_combrel.transfer.methods.experts import best_by_ucb1
+from sb3_combrel.transfer.methods.master import squared_errors
+from sb3_combrel.transfer.prior.copies import Copies
+from sb3_combrel.transfer.prior.copy_sums import CopySums
 from sb3_combrel.transfer.source_model import SourceModel
 from sb3_combrel.transfer.source_policy import SourcePolicy
 
@@ -348,3 +351,19 @@ def test_the_targets_model_decides_for_a_prior_unless_an_argument_is_one_of_inst
     undecided = MASTER(walk_source())
     assert undecided.arguments()["use"] is None and small(transfer=undecided).policy.transfer.use == "prior"
     assert small(transfer=undecided, degree=0).policy.transfer.use == "instances"
+
+
+def test_a_source_action_that_no_instance_has_is_never_the_best():
+    source = source_of()
+    source = replace(source, actions=np.zeros_like(source.actions))
+    copies = Copies([source], np.zeros(1, dtype=np.int64), np.array([[0, 1]]), np.ones((1, 2)), 0.2)
+    sums = CopySums.zero(1, copies.most_actions, 2, 2)
+    for state in np.random.default_rng(0).random((10, 2)):
+        copies.measure(state, 0, np.zeros(2), sums)
+    errors = squared_errors(copies, sums)
+    assert np.isfinite(errors[:, :, 0]).all() and np.isinf(errors[:, :, 1]).all()
+
+
+def test_a_method_that_compares_no_predictions_says_so():
+    report = small(transfer=MappingExperts(walk_source(), max_experts=2)).learn(40).transfer.report()
+    assert report.sentence == "The method does not say how well the source explains the target; its figures may."
