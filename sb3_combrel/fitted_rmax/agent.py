@@ -472,6 +472,7 @@ class FittedRMaxAgent:
         self._build(width=self.mdp.arrays.to.shape[2])
         if learned:
             self._method.set_state(learned)
+            self._method.sample_moved()
         self._widen(min(0.0, lowest) / LONGEST_PLAN)
 
         def moved(state: np.ndarray) -> np.ndarray:

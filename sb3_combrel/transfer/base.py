@@ -234,6 +234,9 @@ class Transfer(ABC):
         Afterwards every pair of the sample is asked for once more: :meth:`changed` need not report this.
         """
 
+    def sample_moved(self) -> None:  # noqa: B027 - most keep nothing by state of the sample
+        """Take in, after :meth:`set_state`, that the sample had other states when the state was returned."""
+
     def statistics(self) -> dict[str, float]:
         """Return figures for the logger, by name."""
         return {}

@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from helpers import naive_transfer as naive
 from helpers.agents import make_agent
 from helpers.walk import Walk, small, walk_source
 from stable_baselines3.common.callbacks import BaseCallback
@@ -166,6 +167,21 @@ def test_what_is_transferred_stays_when_all_is_computed_anew(degree):
     agent.rescale(agent.task.scaling, agent.task.shared_scaling)
     after = agent.mdp.arrays.modelled & ~agent.model.known
     assert before.sum() > 100 and (after[before] | agent.model.known[before]).all()
+
+
+def test_choices_of_grid_points_are_those_of_where_they_are_when_lines_have_moved():
+    rng = np.random.default_rng(9)
+    agent = small(transfer=COMBREL(naive.random_source(rng, 60, 2, 2), use="instances", min_compliance=0.0)).agent
+    for _ in range(40):
+        transition = naive.random_transition(rng, 2, 2)
+        agent.update(transition.state, transition.action, -1.0, transition.next_state, False)
+    method, lines = agent.transfer, np.abs(agent.grid.arrays.lines) ** 1.5
+    agent.rescale(agent.task.scaling, agent.task.shared_scaling, lines)
+    n_actions, points = agent.task.n_actions, method.task.sample_states
+    for action, chosen in enumerate(method.choices().reshape(n_actions, -1)):
+        at = method.selected(points, np.full(len(points), action))
+        np.testing.assert_array_equal(chosen, at)
+    assert len(np.unique(method.choices())) > 4
 
 
 @pytest.mark.parametrize("degree", [0, 1])

@@ -92,6 +92,25 @@ def test_choices_depend_on_what_was_seen_and_those_of_known_pairs_are_renewed_wh
     np.testing.assert_array_equal(asking.choices_of(lazy), once.choices())
 
 
+def test_where_the_sample_moves_choices_are_those_of_its_new_states():
+    rng = np.random.default_rng(1)
+    source = naive.random_source(np.random.default_rng(9), 60, 2, 2)
+    transitions = [naive.random_transition(rng, 3, 2) for _ in range(40)]
+    there, task = naive.target_task(0.6 * POINTS, 2), naive.target_task(POINTS, 2)
+    methods = [asking.bound(COMBREL(source), each) for each in (there, task, task)]
+    before, moved, anew = methods
+    for method in (before, anew):
+        for transition in transitions:
+            asking.show(method, transition)
+        asking.changed_pairs(method)
+    moved.set_state(before.get_state())
+    np.testing.assert_array_equal(moved.choices(), before.choices())
+    moved.sample_moved()
+    np.testing.assert_array_equal(moved.choices(), anew.choices())
+    assert moved.statistics()["transfer/switches"] == before.statistics()["transfer/switches"]
+    assert (moved.choices() != before.choices()).sum() > 10
+
+
 def test_measured_in_the_first_episode_nothing_is_transferred_before_it_ends_and_nothing_changes_after():
     rng = np.random.default_rng(2)
     source, task = naive.random_source(rng, 200, 2, 2), naive.target_task(POINTS, 2)

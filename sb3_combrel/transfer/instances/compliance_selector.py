@@ -191,7 +191,8 @@ class ComplianceSelector(Selector):
     def confidence(self, action: int) -> Confidence | None:
         n_points = len(self.task.sample_states)
         pairs = action * n_points + np.arange(n_points)
-        pairs = pairs[self._choice[pairs] >= 0]
+        # What is known needs no choice any more, and its choice is not renewed.
+        pairs = pairs[(self._choice[pairs] >= 0) & ~self._due.ravel()[pairs]]
         if len(pairs) == 0:
             return None
         if len(pairs) > MAX_COMPARED:
@@ -231,6 +232,12 @@ class ComplianceSelector(Selector):
         self._draws_at = np.clip(state["draws_at"], 0.0, 1.0)
         self._renewal_due = float(state["renewal_due"][0])
         self.n_switches = int(state["switches"][0])
+
+    def sample_moved(self) -> None:
+        before = self.n_switches
+        self._choice[:] = -1
+        self._renew(np.flatnonzero(self._near_of_pair[:, 0] >= 0))
+        self.n_switches = before
 
     def statistics(self) -> dict[str, float]:
         chosen = self._choice[self._choice >= 0]

@@ -91,6 +91,9 @@ class Selector(ABC):
         for i in range(self.transitions.n):
             self.add_transition(i)
 
+    def sample_moved(self) -> None:  # noqa: B027 - most choose the same in all states, or at random
+        """Choose anew, after :meth:`set_state`, for a sample of other states."""
+
     def statistics(self) -> dict[str, float]:
         """Return figures for the logger, by name."""
         return {}

@@ -232,6 +232,10 @@ class MappingTransfer(Transfer):
     def break_off(self) -> None:
         self._source_use.break_off()
 
+    def sample_moved(self) -> None:
+        if self.use == "instances":
+            self._instances.selector.sample_moved()
+
     def note_use(self, transferred: TransferredInstances) -> None:
         if self.use == "instances":
             self._instances.note_use(transferred)
