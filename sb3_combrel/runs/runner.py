@@ -13,11 +13,13 @@ import pickle
 import signal
 import socket
 import threading
+import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -287,11 +289,25 @@ def perform(name: str, packed: bytes, version: str, caller: int) -> _Outcome:
     if os.getpid() != caller and threading.current_thread() is threading.main_thread():
         # Ctrl-C reaches the workers as well; the caller ends them.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+        _end_with(caller)
     with _one_at_a_time, _one_thread():
         try:
             return name, cloudpickle.dumps(pickle.loads(packed).carry_out())
         except Exception as error:  # whatever a third party's code raises
             return name, {"error": _in_one_line(error), "traceback": traceback.format_exc()}
+
+
+@cache
+def _end_with(caller: int) -> None:
+    """End this worker when its caller has gone, on the same machine: one that was killed can't, and a job may take hours."""
+
+    def wait() -> None:
+        while os.getppid() == caller:
+            time.sleep(1.0)
+        os._exit(1)
+
+    if os.getppid() == caller:
+        threading.Thread(target=wait, daemon=True).start()
 
 
 def _in_one_line(error: Exception) -> str:
