@@ -24,7 +24,7 @@ from sb3_combrel.common.version import __version__
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 from sb3_combrel.fitted_rmax.unpickling import check_pickles
-from sb3_combrel.transfer.by_name import check_argument_names, describe_transfer
+from sb3_combrel.transfer.by_name import check_argument_names, describe_transfer, make_transfer
 
 # The digits of real numbers hardly compress: higher levels take longer and gain a hundredth.
 COMPRESSION = 1
@@ -106,8 +106,8 @@ class SavedAlgorithm(BaseAlgorithm):
         :param custom_objects: objects that replace those of the file
         :param print_system_info: whether to print system info from the saved model and the current system info
         :param force_reset: force a call to ``reset()`` before training
-        :param kwargs: arguments of the constructor to change; ``transfer=`` where a transfer method could not be saved;
-            ``instances=`` for more past data. Without ``seed=`` the random number generators continue from their saved states.
+        :param kwargs: arguments of the constructor to change; ``transfer=`` where a transfer method could not be saved, or the
+            saved one once more; ``instances=`` for more past data. Without ``seed=`` the random number generators continue from their saved states.
         :return: new model instance with loaded parameters
         :raises FileNotFoundError: if there is no such file
         :raises ValueError: if the file is damaged, was not saved by this class, or does not fit the other arguments
@@ -121,6 +121,12 @@ class SavedAlgorithm(BaseAlgorithm):
         with _naming(path, changed):
             archive = _read(path)
             check_pickles(archive, custom_objects or ())
+            with zipfile.ZipFile(archive) as content:
+                saved = json.loads(content.read("data")).get("transfer")
+            archive.seek(0)
+        if "transfer" in kwargs and isinstance(saved, dict) and saved.get("arguments") is not None:
+            _check_same_transfer(kwargs.pop("transfer"), saved, path)
+        with _naming(path, changed):
             model = super().load(
                 archive, environment, device, custom_objects, print_system_info, force_reset, **kwargs  # type: ignore[arg-type]
             )
@@ -165,6 +171,20 @@ class SavedAlgorithm(BaseAlgorithm):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy"], []
+
+
+def _check_same_transfer(given: Any, saved: dict[str, Any], path: object) -> None:
+    """:raises ValueError: if a method is not the one that :func:`describe_transfer` described, once it was bound"""
+    described = describe_transfer(make_transfer(given)) or {"method": None}
+    # What is left to the method is settled when it is bound.
+    wanted = {name: each for name, each in (described.get("arguments") or {}).items() if each is not None}
+    found = {name: saved["arguments"].get(name) for name in wanted}
+    if described["method"] != saved["method"] or json.dumps(wanted) != json.dumps(found):
+        raise ValueError(
+            f"transfer must be the method that {path} was saved with, with the same source and arguments, as what it has "
+            f"learned is kept, got {given!r} for {saved['method']}: leave it out, or make a new model with the instances: "
+            f"FittedRMax(env, instances={str(path)!r}, transfer=...)"
+        )
 
 
 def _check_room(sizes: np.ndarray, model: Any) -> None:

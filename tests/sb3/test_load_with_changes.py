@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from helpers.walk import Walk, small, walk_source
+from helpers.walk import Walk, same_parameters, small, walk_source
 from stable_baselines3 import DQN
 
-from sb3_combrel import COMBREL, FittedRMax
+from sb3_combrel import COMBREL, MASTER, TIMBREL, FittedRMax, InterTaskMapping
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 
 
@@ -78,3 +78,25 @@ def test_a_policy_of_ones_own_does_not_hide_what_is_wrong(tmp_path):
     FittedRMax(OwnPolicy, Walk(), seed=0).save(tmp_path / "model")
     with pytest.raises(ValueError, match="is a model of another task than env: Observation spaces do not match"):
         FittedRMax.load(tmp_path / "model", env="CartPole-v1")
+
+
+IDENTITY, MIRRORED = InterTaskMapping([0, 1], [0, 1]), InterTaskMapping([0, 1], [1, 0])
+
+
+@pytest.mark.parametrize(
+    ("method", "other"),
+    [
+        (lambda: COMBREL(walk_source()), COMBREL(walk_source(80))),
+        (lambda: COMBREL(walk_source(), use="instances"), COMBREL(walk_source(), use="prior")),
+        (lambda: COMBREL.paper(walk_source()), None),
+        (lambda: TIMBREL(walk_source(), IDENTITY), TIMBREL(walk_source(), MIRRORED)),
+        (lambda: {"sb3_combrel.SampleTransfer": {"source": walk_source()}}, COMBREL(walk_source())),
+        (lambda: MASTER(walk_source(), n_random_steps=10), MASTER(walk_source(), n_random_steps=11)),
+    ],
+)
+def test_a_transfer_method_may_be_given_again_and_no_other_as_what_it_has_learned_is_kept(method, other, tmp_path):
+    model = small(transfer=method()).learn(30)
+    model.save(tmp_path / "walk")
+    assert same_parameters(FittedRMax.load(tmp_path / "walk", transfer=method()), model)
+    with pytest.raises(ValueError, match=r"^transfer must be the method that .*FittedRMax\(env, instances="):
+        FittedRMax.load(tmp_path / "walk", transfer=other)
