@@ -5,7 +5,9 @@ from typing import TYPE_CHECKING, Any
 from sb3_combrel.common.version import __version__ as __version__
 from sb3_combrel.fitted_rmax import source_learner  # noqa: F401 - sources.SourceInstances.from_fitted_rmax finds it
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
-from sb3_combrel.mappings import FactoredMapping, InterTaskMapping, MappingSet
+from sb3_combrel.mappings.factored_mapping import FactoredMapping
+from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
+from sb3_combrel.mappings.mapping_set import MappingSet
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.tensorboard.callback import with_dashboard
 from sb3_combrel.tensorboard.explain import explain

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from helpers.sources import assert_same, some_source
 
+from sb3_combrel import InterTaskMapping, MappingSet
 from sb3_combrel.common.serialisation import KIND, from_plain, to_plain
-from sb3_combrel.mappings import AllActionMappings, BalancedActionMappings, InterTaskMapping, ListedActionMappings, MappingSet
+from sb3_combrel.mappings.action_mappings import AllActionMappings, BalancedActionMappings, ListedActionMappings
 
 
 def there_and_back(value):

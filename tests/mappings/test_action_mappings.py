@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.mappings import SMALL_SIZES
 
-from sb3_combrel.mappings import AllActionMappings, BalancedActionMappings, ListedActionMappings
+from sb3_combrel.mappings.action_mappings import AllActionMappings, BalancedActionMappings, ListedActionMappings
 
 
 class TestActionMappings:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_combrel import InterTaskMapping, MappingSet
-from sb3_combrel.mappings import AllActionMappings, ListedActionMappings
+from sb3_combrel.mappings.action_mappings import AllActionMappings, ListedActionMappings
 
 
 def check_against_members(mapping_set, n_source_actions):

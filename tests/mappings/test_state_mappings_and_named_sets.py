@@ -8,7 +8,8 @@ import pytest
 from helpers.mappings import MOUNTAIN_CAR, SMALL_SIZES, choices
 
 from sb3_combrel import InterTaskMapping, MappingSet
-from sb3_combrel.mappings import UNMAPPED, resolve
+from sb3_combrel.mappings.inter_task_mapping import UNMAPPED
+from sb3_combrel.mappings.named_sets import resolve
 from sb3_combrel.mappings.state_mappings import copies_of_source
 
 
