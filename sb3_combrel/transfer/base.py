@@ -6,7 +6,7 @@ import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -60,9 +60,6 @@ class Transfer(ABC):
     #: How the model uses the source: "instances": they join the target's own where these do not suffice; "prior": it is the
     #: mean that they are fitted to, see :meth:`prior`; "actions": not at all, see :meth:`action`.
     use: str = "instances"
-
-    #: Arguments that are shown even if they have their defaults, as these are no advice.
-    always_shown: ClassVar[tuple[str, ...]] = ()
 
     #: Which of several environments the next call of :meth:`action`, :meth:`observe` or :meth:`end_episode` is about.
     environment: int = 0
@@ -260,14 +257,13 @@ class Transfer(ABC):
             )
 
     def __repr__(self) -> str:
-        """The method with those of its arguments that differ from their defaults, and those of :attr:`always_shown`."""
+        """The method with those of its arguments that differ from their defaults."""
         try:
             given = self.arguments()
         except AttributeError:
             return object.__repr__(self)
         defaults = {name: each.default for name, each in inspect.signature(type(self)).parameters.items()}
-        told = self.always_shown
-        shown = [f"{name}={value!r}" for name, value in given.items() if name in told or not _equal(value, defaults.get(name))]
+        shown = [f"{name}={value!r}" for name, value in given.items() if not _equal(value, defaults.get(name))]
         return f"{type(self).__name__}({', '.join(shown)})"
 
 

@@ -46,8 +46,6 @@ class TIMBREL(MappingTransfer):
     :raises ValueError: if an argument is out of range; when learning starts, if source or mapping do not fit the target
     """
 
-    always_shown: ClassVar[tuple[str, ...]] = ("mapping",)
-
     of_prior: ClassVar[tuple[str, ...]] = (*MappingTransfer.of_prior, "mapping")
 
     mapping: str | InterTaskMapping | FactoredMapping | Sequence[InterTaskMapping] | dict[str, Any] | None = None
