@@ -225,9 +225,9 @@ def test_a_learned_translation_hears_of_which_environment_a_transition_is():
     for i in range(30):
         state = rng.random(2)
         agent.update(state, i % 2, -1.0, state, False, i % 3)
-        if agent.transfer._timbrel is not None and i >= 20:
+        if agent.transfer.translated is not None and i >= 20:
             assert agent.transfer._timbrel.environment == i % 3
-    assert agent.transfer._timbrel is not None
+    assert agent.transfer.translated is not None
 
 
 class OneArray(Walk):

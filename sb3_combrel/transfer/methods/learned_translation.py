@@ -110,7 +110,9 @@ class LearnedTranslation(Transfer):
         self._rows = self._samples
         #: All source instances in target coordinates, raw units of the target; None until the mapping has been learned.
         self.translated: SourceInstances | None = None
-        self._timbrel: TIMBREL | None = None
+        # It transfers the translated instances; as long as there are none it is asked for nothing.
+        self._timbrel = TIMBREL(self._source, InterTaskMapping((0,) * task.n_variables, (0,) * task.n_actions))
+        self._timbrel.bind(task, np.random.default_rng(0))
         self._seconds = 0.0
 
     def mapping_steps(self) -> int:
@@ -121,7 +123,7 @@ class LearnedTranslation(Transfer):
         return int(self.rng.integers(self._bound_task.n_actions)) if len(self._samples) < self.n_random_steps else None
 
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
-        if self._timbrel is not None:
+        if self.translated is not None:
             self._timbrel.environment = self.environment
             self._timbrel.observe(state, action, reward, next_state, terminated)
             return
@@ -146,7 +148,7 @@ class LearnedTranslation(Transfer):
         self._transfer_rows(np.column_stack([states, found_actions.argmax(axis=1), np.clip(states + effects, 0.0, 1.0)]))
         self._seconds = perf_counter() - began
 
-    def _transfer_rows(self, rows: np.ndarray) -> TIMBREL:
+    def _transfer_rows(self, rows: np.ndarray) -> None:
         task, source, d = self._bound_task, self._source, self._bound_task.n_variables
         self._rows = rows
         states, after = task.scaling.to_raw(rows[:, :d]), task.scaling.to_raw(rows[:, d + 1 :])
@@ -158,27 +160,25 @@ class LearnedTranslation(Transfer):
         names = ("breadth", "breadth_decay", "transfer_terminals")
         self._timbrel = TIMBREL(self.translated, identity, **{name: getattr(self, name) for name in names})
         self._timbrel.bind(task, self.rng)
-        return self._timbrel
 
     def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
-        if self._timbrel is None:
-            return TransferredInstances.empty(len(actions), states.shape[1])
+        if self.translated is None:
+            return super().transferred(states, actions, own_weight)
         return self._timbrel.transferred(states, actions, own_weight)
 
     def changed(self, known: np.ndarray) -> bool | np.ndarray:
-        return False if self._timbrel is None else self._timbrel.changed(known)
+        return self.translated is not None and self._timbrel.changed(known)
 
     def end_episode(self, truncated: bool) -> None:
-        if self._timbrel is not None:
+        if self.translated is not None:
             self._timbrel.environment = self.environment
             self._timbrel.end_episode(truncated)
 
     def break_off(self) -> None:
-        if self._timbrel is not None:
-            self._timbrel.break_off()
+        self._timbrel.break_off()
 
     def note_use(self, transferred: TransferredInstances) -> None:
-        if self._timbrel is not None:
+        if self.translated is not None:
             self._timbrel.note_use(transferred)
 
     def lowest_reward(self) -> float:
@@ -187,11 +187,11 @@ class LearnedTranslation(Transfer):
     def statistics(self) -> dict[str, float]:
         figures = {
             "transfer/steps_to_find_mapping": self.mapping_steps(),
-            "transfer/mapping_found": float(self._timbrel is not None),
+            "transfer/mapping_found": float(self.translated is not None),
             "transfer/mapping_seconds": self._seconds,
             "transfer/translated_spread": self._spread(),
         }
-        return figures if self._timbrel is None else {**figures, **self._timbrel.statistics()}
+        return figures if self.translated is None else {**figures, **self._timbrel.statistics()}
 
     def _spread(self) -> float:
         """Standard deviation of the translated states over that of the sample's, mean over variables; near 0: no relation."""
@@ -202,19 +202,11 @@ class LearnedTranslation(Transfer):
         return float((spread / np.maximum(sampled, 1e-12))[sampled > 1e-12].mean()) if (sampled > 1e-12).any() else np.nan
 
     def get_state(self) -> dict[str, np.ndarray]:
-        return {"samples": self._samples.copy(), "translated": self._rows.copy(), **self._state_of_timbrel()}
-
-    def _state_of_timbrel(self) -> dict[str, np.ndarray]:
-        """The state of what transfers the instances; as long as there are none, arrays of the same shapes."""
-        timbrel, task = self._timbrel, self._bound_task
-        if timbrel is None:
-            timbrel = TIMBREL(self._source, InterTaskMapping((0,) * task.n_variables, (0,) * task.n_actions))
-            timbrel.bind(task, np.random.default_rng(0))
-        return {f"timbrel_{name}": array for name, array in timbrel.get_state().items()}
+        of_timbrel = {f"timbrel_{name}": array for name, array in self._timbrel.get_state().items()}
+        return {"samples": self._samples.copy(), "translated": self._rows.copy(), **of_timbrel}
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         self._samples = state["samples"].copy()
-        if len(state["translated"]) != len(self._source):
-            return
-        timbrel = self._transfer_rows(state["translated"].copy())
-        timbrel.set_state({name.removeprefix("timbrel_"): array for name, array in state.items()})
+        if len(state["translated"]) == len(self._source):
+            self._transfer_rows(state["translated"].copy())
+            self._timbrel.set_state({name.removeprefix("timbrel_"): array for name, array in state.items()})
