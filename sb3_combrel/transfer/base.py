@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_combrel.common.periodic import periodic_flags
+from sb3_combrel.common.periodic import differences, periodic_flags
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
 from sb3_combrel.transfer.report import NotBoundError, TransferReport
@@ -44,6 +44,10 @@ class TargetTask:
     def n_variables(self) -> int:
         """Number of state variables."""
         return self.scaling.n_variables
+
+    def effect(self, state: np.ndarray, next_state: np.ndarray) -> np.ndarray:
+        """Next state minus state, unit coordinates; of periodic variables the shortest way."""
+        return differences(next_state, state, np.array(self.periodic))
 
 
 class Transfer(ABC):

@@ -12,7 +12,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sb3_combrel.common.checks import check_boolean, check_positive
-from sb3_combrel.common.periodic import differences
 from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
 from sb3_combrel.mappings.action_mappings import AllActionMappings
 from sb3_combrel.mappings.mapping_set import MappingSet
@@ -136,7 +135,6 @@ class MappingTransfer(Transfer):
         if self._left_open:
             self.use, self._left_open = "prior" if task.takes_prior else "instances", {}
         self.source, self.mappings = loaded(self.source, self.mappings, task)
-        self._periodic = np.array(task.periodic)
         self._source_use: SourceUse = self._make_prior(task) if self.use == "prior" else self._make_instances(task)
 
     def _make_instances(self, task: TargetTask) -> InstanceTransfer:
@@ -223,7 +221,7 @@ class MappingTransfer(Transfer):
 
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
         self._source_use.environment = self.environment
-        self._source_use.observe(state, action, reward, differences(next_state, state, self._periodic), terminated)
+        self._source_use.observe(state, action, reward, self._bound_task.effect(state, next_state), terminated)
 
     def end_episode(self, truncated: bool) -> None:
         self._source_use.environment = self.environment

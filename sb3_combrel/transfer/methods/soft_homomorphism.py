@@ -8,7 +8,6 @@ from time import perf_counter
 import numpy as np
 
 from sb3_combrel.common.checks import check_boolean, check_count, check_positive
-from sb3_combrel.common.periodic import differences
 from sb3_combrel.common.transferred import PriorPredictions
 from sb3_combrel.sources.recipes import checked_source
 from sb3_combrel.transfer.base import TargetTask, Transfer
@@ -99,7 +98,6 @@ class SoftHomomorphism(Transfer):
         self._shape = Logits(np.zeros(shape), np.zeros((copies, task.n_actions, source.n_actions)))
         self._logits: Logits | None = None
         self._mixture = soft.MixturePredictions(model, self._readings, mean, task.sample_states)
-        self._periodic = np.array(task.periodic)
         self._transitions = RecordedTransitions(d)
         self._evidence = PriorEvidence(task.n_actions, d, float(np.abs(source.rewards).max()))
         self._own: OwnPrediction | None = None
@@ -123,7 +121,7 @@ class SoftHomomorphism(Transfer):
         self._own = effect, leverage
 
     def observe(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> None:
-        effect = differences(next_state, state, self._periodic)
+        effect = self._bound_task.effect(state, next_state)
         self._n_observed += 1
         if self._n_observed <= self.max_transitions:
             self._transitions.add(state, action, reward, effect, terminated)

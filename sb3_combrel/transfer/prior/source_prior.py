@@ -7,7 +7,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from sb3_combrel.common.periodic import differences
 from sb3_combrel.common.transferred import PriorPredictions
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.outcome_evidence import TRANSITIONS_BEFORE_WARNING, RegionErrors, warn_of_error
@@ -53,7 +52,6 @@ class SourcePrior:
         first_renewal: int = FIRST_RENEWAL,
     ):
         self.task = task
-        self._periodic = np.array(task.periodic)
         self.sources = copies.sources
         self.copies = copies
         self.candidates = PriorCandidates(copies, task)
@@ -138,14 +136,12 @@ class SourcePrior:
                 self._warned = True
                 warn_of_error(self.sources, self.n_observed, self.error())
         episode = self._episodes[self.environment]
-        if episode and not self._leads_to(episode[-1], state):
-            # Past data, or transitions that are taken in once more in other unit coordinates: episodes may be cut anywhere.
-            episode.clear()
+        if episode:
+            last_state, _, last_effect = episode[-1]
+            if np.abs(self.task.effect(state, last_state + last_effect)).max() >= SAME_STATE:
+                # Past data, or transitions that are taken in once more in other unit coordinates: episodes may be cut anywhere.
+                episode.clear()
         episode.append((state, reward, effect))
-
-    def _leads_to(self, last: tuple[np.ndarray, float, np.ndarray], state: np.ndarray) -> bool:
-        apart = differences(last[0] + last[2], state, self._periodic)
-        return float(np.abs(apart).max()) < SAME_STATE
 
     def _check(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, recorded: bool) -> None:
         """Compare a transition with what was predicted of it."""
