@@ -59,16 +59,12 @@ def make_prior(
     :raises ValueError: if source or mappings do not fit the target
     """
     sources = load_sources(source)
-    parts = sources, task, breadth
     choose: Chooser | Choice
-    if is_factored(mappings):
-        if isinstance(mappings, str):
-            copies = _named_copies(mappings, *parts)
-            choose = draw_factored(copies, task.n_actions, drawn) if drawn else partial(choose_factored, copies)
-        else:
-            copies, choose = _given_factored(mappings, *parts)
-    elif given:
-        copies, choose = _given(mappings, *parts)
+    if isinstance(mappings, str) and is_factored(mappings):
+        copies = _named_copies(mappings, sources, task, breadth)
+        choose = draw_factored(copies, task.n_actions, drawn) if drawn else partial(choose_factored, copies)
+    elif given or is_factored(mappings):
+        copies, choose = _given(mappings, sources, task, breadth)
     else:
         candidates = Candidates(source, mappings, task)
         copies = copies_of(candidates, breadth)
@@ -134,27 +130,22 @@ def check_one_source(sources: Sequence[SourceInstances]) -> None:
         )
 
 
-def _given_factored(
-    mapping: Any, sources: Sequence[SourceInstances], task: TargetTask, breadth: float
-) -> tuple[Copies, Choice]:
-    """The copies of a factored mapping."""
-    if not isinstance(mapping, FactoredMapping):
-        mapping = FactoredMapping(**mapping)
-    check_one_source(sources)
-    mapping.check(**sizes(sources[0], task))
-    actions = np.array([copy.action for copy in mapping.copies], dtype=np.int64).T
-    numbers = np.tile(np.arange(len(mapping.copies)), (task.n_actions, 1))
-    return _of_mappings(mapping.copies, sources, breadth), Choice(numbers, actions.copy())
-
-
 def _given(mappings: Any, sources: Sequence[SourceInstances], task: TargetTask, breadth: float) -> tuple[Copies, Choice]:
-    """One mapping, or one for each target action."""
+    """The copies of a factored mapping; or one mapping, or one for each target action, which are a copy each."""
     check_one_source(sources)
-    each = mapping_of_each_action(resolve(mappings, **sizes(sources[0], task)), task.n_actions)
-    used = list(dict.fromkeys(each))
-    copies = np.array([[used.index(mapping)] for mapping in each], dtype=np.int64)
-    actions = np.array([[mapping.action[a]] for a, mapping in enumerate(each)], dtype=np.int64)
-    return _of_mappings(used, sources, breadth), Choice(copies, actions)
+    if is_factored(mappings):
+        factored = mappings if isinstance(mappings, FactoredMapping) else FactoredMapping(**mappings)
+        factored.check(**sizes(sources[0], task))
+        used = list(factored.copies)
+        of_actions = [used] * task.n_actions
+    else:
+        each = mapping_of_each_action(resolve(mappings, **sizes(sources[0], task)), task.n_actions)
+        used = list(dict.fromkeys(each))
+        of_actions = [[mapping] for mapping in each]
+    numbers = np.array([[used.index(mapping) for mapping in of_action] for of_action in of_actions], dtype=np.int64)
+    actions = np.array([[mapping.action[a] for mapping in of] for a, of in enumerate(of_actions)], dtype=np.int64)
+    state, sign = (np.array([getattr(mapping, name) for mapping in used]) for name in ("state_index", "state_sign"))
+    return Copies(sources, np.zeros(len(used), dtype=np.int64), state, sign, breadth), Choice(numbers, actions)
 
 
 def mapping_of_each_action(given: MappingSet, n_actions: int) -> list[InterTaskMapping]:
@@ -162,13 +153,6 @@ def mapping_of_each_action(given: MappingSet, n_actions: int) -> list[InterTaskM
     if len(given) not in (1, n_actions):
         raise ValueError(f"mapping must be one mapping or one for each of the {n_actions} target actions, got {len(given)}")
     return [given[a if len(given) > 1 else 0] for a in range(n_actions)]
-
-
-def _of_mappings(mappings: Sequence[InterTaskMapping], sources: Sequence[SourceInstances], breadth: float) -> Copies:
-    """The state mappings of some mappings to a source."""
-    state = np.array([mapping.state_index for mapping in mappings])
-    sign = np.array([mapping.state_sign for mapping in mappings])
-    return Copies(sources, np.zeros(len(state), dtype=np.int64), state, sign, breadth)
 
 
 def copies_of(candidates: Candidates, breadth: float) -> Copies:

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 
 from sb3_combrel.planning.planner import Planner
+from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import stacked_instances
 from sb3_combrel.transfer.prior.copies import Copies, distinct_rows
@@ -77,10 +78,8 @@ class ValueBound:
 
     def _bound_in_cells(self, copy: int, states: np.ndarray) -> np.ndarray:
         """The largest of the source's values around what each state is in a copy."""
-        planner = self._planner(copy)
-        grid = planner.mdp.grid
-        at = self._copies.as_copy(copy, states)[:, : grid.n_variables]
-        return np.asarray(planner.values[grid.cells_around(at)].max(axis=1))
+        planner, at = self._seen_by(copy, states)
+        return np.asarray(planner.values[planner.mdp.grid.cells_around(at)].max(axis=1))
 
     def _costs_are_alike(self, used: list[int]) -> bool:
         rewards = np.concatenate([self._copies.sources[self._copies.source[copy]].rewards for copy in used])
@@ -89,29 +88,28 @@ class ValueBound:
     def _bound(self, copy: int) -> np.ndarray:
         """The source's value at the state that each state of the target's sample is in a copy."""
         if copy not in self._of_copy:
-            planner = self._planner(copy)
-            grid = planner.mdp.grid
-            at = self._copies.as_copy(copy, self._sample_states)[:, : grid.n_variables]
+            planner, at = self._seen_by(copy, self._sample_states)
             different, kind = distinct_rows(at)
-            self._of_copy[copy] = np.array([grid.interpolate(planner.values, at[i]) for i in different])[kind]
+            self._of_copy[copy] = np.array([planner.mdp.grid.interpolate(planner.values, at[i]) for i in different])[kind]
         return self._of_copy[copy]
 
-    def _planner(self, copy: int) -> Planner:
+    def _seen_by(self, copy: int, states: np.ndarray) -> tuple[Planner, np.ndarray]:
+        """The planner of a copy's source, and states of the target as states of it."""
         number = int(self._copies.source[copy])
         if number not in self._planners:
-            self._planners[number] = self._plan(number)
-        return self._planners[number]
+            self._planners[number] = self._plan(self._copies.sources[number])
+        planner = self._planners[number]
+        return planner, self._copies.as_copy(copy, states)[:, : planner.mdp.grid.n_variables]
 
-    def _plan(self, number: int) -> Planner:
+    def _plan(self, source: SourceInstances) -> Planner:
         """Plan in a source, from above: values are upper bounds after any number of sweeps."""
-        source, breadth = self._copies.sources[number], self._copies.breadth
+        breadth = self._copies.breadth
         taken, actions = np.unique(source.actions, return_inverse=True)
         source = dataclasses.replace(source, actions=actions, n_actions=len(taken), action_names=())
         model = SourceModel(stacked_instances([source]), breadth)
         mdp = source_mdp(source, model, self._gamma, breadth, LEAST_WEIGHT)
-        highest = self.max_value
         # Lower than so many sweeps can get.
-        lowest = min(0.0, highest) + (MAX_SWEEPS + 1) * MAX_STEPS * min(0.0, float(source.rewards.min())) - 1.0
-        planner = Planner(mdp, max_value=highest, min_value=lowest, tolerance=planning_tolerance(source))
+        lowest = min(0.0, self.max_value) + (MAX_SWEEPS + 1) * MAX_STEPS * min(0.0, float(source.rewards.min())) - 1.0
+        planner = Planner(mdp, max_value=self.max_value, min_value=lowest, tolerance=planning_tolerance(source))
         planner.sweep(MAX_SWEEPS)
         return planner
