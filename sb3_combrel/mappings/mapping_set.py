@@ -314,16 +314,13 @@ class MappingSet:
         if self.pairs is None:
             first = int(self._first_equal[state_index])
             return first * self.n_action_mappings + self.actions.first(action, source_action)
-        matching = self._matching(state_index, action, source_action)
+        same_state = self._states == self._first_equal[state_index]
+        matching = np.flatnonzero(same_state & (self._source_actions[:, action] == source_action))
         if not matching.size:
             raise ValueError(
                 f"no mapping of the set has state mapping {state_index} and source action {source_action} for {action}"
             )
         return int(matching[0])
-
-    def _matching(self, state_index: int, action: int, source_action: int) -> Ints:
-        same_state = self._states == self._first_equal[state_index]
-        return np.flatnonzero(same_state & (self._source_actions[:, action] == source_action))
 
     def check(self, **sizes: Unpack[TaskSizes]) -> None:
         """Check all state and action mappings against the spaces of the tasks, see :meth:`InterTaskMapping.check`."""
