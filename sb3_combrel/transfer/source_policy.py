@@ -22,8 +22,14 @@ LEAST_WEIGHT_ON_GRID = 0.05
 _TOLERANCE = 0.001  # changes of value up to this part of the range of a step's rewards end the planning
 
 
-def source_mdp(source: SourceInstances, model: SourceModel, gamma: float, breadth: float, min_weight: float) -> FiniteMDP:
-    """Write what each action, held until the cell is left, does on a grid; below ``min_weight`` pairs are optimistic."""
+def plan_source(
+    source: SourceInstances, gamma: float, breadth: float, min_weight: float, bounds: tuple[float, float]
+) -> tuple[SourceModel, Planner]:
+    """Make a source's model and, of what each action, held until the cell is left, does on a grid, a planner without sweeps.
+
+    :param min_weight: pairs with less data are optimistic; ``bounds``: the least and the largest value
+    """
+    model = SourceModel(stacked_instances([source]), breadth)
     grid = fitting_grid(source.n_variables, source.n_actions, None, breadth, LEAST_WEIGHT_ON_GRID, source.periodic)
     mdp = FiniteMDP(grid, source.n_actions, gamma)
     n_points, cells = grid.n_points, grid.arrays.cells
@@ -45,13 +51,9 @@ def source_mdp(source: SourceInstances, model: SourceModel, gamma: float, breadt
         # Of those that have no model it does not matter.
         going = going[~left & (goes_on[going] > 0.0) & (weight[going] >= min_weight)]
     mdp.write_rows(np.arange(len(states)), weight >= min_weight, goes_on[:, None], (at - states)[:, None], reward)
-    return mdp
-
-
-def planning_tolerance(source: SourceInstances) -> float:
-    """Return the change of value that is too small to matter."""
     lowest, highest = float(source.rewards.min()), float(source.rewards.max())
-    return _TOLERANCE * max(highest - lowest, abs(highest), 1e-6)
+    tolerance = _TOLERANCE * max(highest - lowest, abs(highest), 1e-6)
+    return model, Planner(mdp, max_value=bounds[1], min_value=bounds[0], tolerance=tolerance)
 
 
 class SourcePolicy:
@@ -62,13 +64,11 @@ class SourcePolicy:
     """
 
     def __init__(self, source: SourceInstances, gamma: float, breadth: float):
-        self.model = SourceModel(stacked_instances([source]), breadth)
-        mdp = source_mdp(source, self.model, gamma, breadth, MIN_WEIGHT)
         lowest, highest = float(source.rewards.min()), float(source.rewards.max())
         bounds = min(0.0, lowest) / (1.0 - gamma), max(0.0, highest) / (1.0 - gamma)
-        planner = Planner(mdp, max_value=bounds[1], min_value=bounds[0], tolerance=planning_tolerance(source))
+        self.model, planner = plan_source(source, gamma, breadth, MIN_WEIGHT, bounds)
         self.values = planner.cautious_values(MAX_SWEEPS)  #: value of each grid point
-        self.grid = mdp.grid
+        self.grid = planner.mdp.grid
         n, d = source.n_actions, source.n_variables
         self._function = ValueFunction(self.values, self.grid.plain, float(gamma), bounds, planner.upper)
         self._q, self._actions, self._length = QValues(n, d), np.arange(n), np.ones(n, dtype=np.int64)

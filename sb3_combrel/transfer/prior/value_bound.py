@@ -9,11 +9,9 @@ import numpy as np
 from sb3_combrel.planning.planner import Planner
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask
-from sb3_combrel.transfer.candidates import stacked_instances
 from sb3_combrel.transfer.prior.copies import Copies, distinct_rows
 from sb3_combrel.transfer.prior.prior_choice import Choice
-from sb3_combrel.transfer.source_model import SourceModel
-from sb3_combrel.transfer.source_policy import MAX_STEPS, MAX_SWEEPS, planning_tolerance, source_mdp
+from sb3_combrel.transfer.source_policy import MAX_STEPS, MAX_SWEEPS, plan_source
 
 #: States, rewards and effects.
 Episode = list[tuple[np.ndarray, float, np.ndarray]]
@@ -103,13 +101,10 @@ class ValueBound:
 
     def _plan(self, source: SourceInstances) -> Planner:
         """Plan in a source, from above: values are upper bounds after any number of sweeps."""
-        breadth = self._copies.breadth
         taken, actions = np.unique(source.actions, return_inverse=True)
         source = dataclasses.replace(source, actions=actions, n_actions=len(taken), action_names=())
-        model = SourceModel(stacked_instances([source]), breadth)
-        mdp = source_mdp(source, model, self._gamma, breadth, LEAST_WEIGHT)
         # Lower than so many sweeps can get.
         lowest = min(0.0, self.max_value) + (MAX_SWEEPS + 1) * MAX_STEPS * min(0.0, float(source.rewards.min())) - 1.0
-        planner = Planner(mdp, max_value=self.max_value, min_value=lowest, tolerance=planning_tolerance(source))
+        _, planner = plan_source(source, self._gamma, self._copies.breadth, LEAST_WEIGHT, (lowest, self.max_value))
         planner.sweep(MAX_SWEEPS)
         return planner
