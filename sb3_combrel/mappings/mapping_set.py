@@ -282,6 +282,23 @@ class MappingSet:
         sign = self.signs[row].tolist()
         return InterTaskMapping(_state(self.state_mappings[row]), self.actions[action_index], sign, names=self.names)
 
+    @property
+    def combines_freely(self) -> bool:
+        """Whether every state mapping comes with every choice of a source action for each target action."""
+        return self.pairs is None and isinstance(self.actions, AllActionMappings)
+
+    def members(self) -> Iterator[tuple[Ints, Ints]]:
+        """All members in their order, some at once: rows of ``state_mappings``, shape (n,), and source actions.
+
+        Of these there is one for each target action, shape (n, n_target_actions).
+        """
+        if self.pairs is not None:
+            yield self.pairs[:, 0], self._source_actions
+            return
+        actions = np.array([self.actions[number] for number in range(self.n_action_mappings)], dtype=np.int64)
+        for row in range(self.n_state_mappings):
+            yield np.full(len(actions), row, dtype=np.int64), actions
+
     def source_actions_for(self, action: int) -> Ints:
         """The source actions, ascending, that a target action is mapped to; ``ValueError`` if there is no such action."""
         self._check_action(action)

@@ -105,14 +105,8 @@ class Candidates:
                 f'mappings must hold at most {MAX_WHOLE_MAPPINGS} whole mappings with neighbors="state_action", got {n_all}; '
                 'a list of mappings or a smaller set would do, or neighbors="action", which needs no whole mappings'
             )
-        found = []
-        for mappings in self.sets:
-            state = [(*index, *sign) for index, sign in zip(mappings.state_mappings, mappings.state_signs, strict=True)]
-            number = {key: k for k, key in enumerate(state)}
-            each = list(mappings)
-            index = [number[(*mapping.state_index, *mapping.state_sign)] for mapping in each]
-            found.append((np.array(index), np.array([mapping.action for mapping in each])))
-        return found
+        members = [zip(*mappings.members(), strict=True) for mappings in self.sets]
+        return [(np.concatenate(rows), np.concatenate(actions)) for rows, actions in members]
 
     def _numbered(self) -> CandidateArrays:
         first = [0]

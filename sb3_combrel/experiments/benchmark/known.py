@@ -47,4 +47,4 @@ def errors_of(pair: Pair, sources: tuple[SourceInstances, ...], transitions: Sou
     effects = differences(after, states, flag_array(known.task.periodic, transitions.n_variables))
     predicted = known.source_prior.predict(states, transitions.actions).effect
     of_known = float(np.sum((effects - predicted) ** 2) / np.sum(effects**2))
-    return Errors(of_known, chosen.source_prior.error(), chosen.source_prior.describe())
+    return Errors(of_known, chosen.source_prior.error(), chosen.describe_prior())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields
 from functools import partial
 from typing import Any, ClassVar
@@ -13,7 +13,6 @@ import numpy as np
 
 from sb3_combrel.common.checks import check_boolean, check_positive
 from sb3_combrel.common.transferred import PriorPredictions, TransferredInstances
-from sb3_combrel.mappings.action_mappings import AllActionMappings
 from sb3_combrel.mappings.mapping_set import MappingSet
 from sb3_combrel.mappings.named_sets import check_mappings
 from sb3_combrel.sources.recipes import checked_source
@@ -248,7 +247,8 @@ class MappingTransfer(Transfer):
         :raises ValueError: as of :attr:`source_prior`
         """
         self._check_bound("describe_prior")
-        return self.source_prior.describe()
+        prior = self.source_prior
+        return prior.candidates.describe_choice(prior.choice)
 
     def candidate(self, number: int) -> Candidate:
         """Return a candidate's parts, by name."""
@@ -320,20 +320,8 @@ def check_either(name: str, value: object, one: str, other: str) -> None:
 def check_action_mappings(sets: Sequence[MappingSet]) -> None:
     """Raise a ValueError if these sets have too many mappings to compare."""
     for mappings in sets:
-        one_by_one = mappings.pairs is None and not isinstance(mappings.actions, AllActionMappings)
-        if one_by_one and mappings.n_action_mappings > MAX_ACTION_MAPPINGS:
+        if mappings.pairs is None and not mappings.combines_freely and mappings.n_action_mappings > MAX_ACTION_MAPPINGS:
             raise ValueError(
                 f"mappings must have at most {MAX_ACTION_MAPPINGS:,} action mappings, or all there are, whose source "
                 f'actions are chosen one by one ("injective"), got {mappings.n_action_mappings:,}'
             )
-
-
-def members_of(mappings: MappingSet) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Go through a set: state mappings, int64, shape (n, 1), with their source actions, int64, shape (n, n_target_actions)."""
-    numbers = range(mappings.n_action_mappings) if mappings.pairs is None else mappings.pairs[:, 1].tolist()
-    actions = np.array([mappings.actions[number] for number in numbers], dtype=np.int64)
-    if mappings.pairs is not None:
-        yield mappings.pairs[:, :1], actions
-        return
-    for row in range(mappings.n_state_mappings):
-        yield np.full((len(actions), 1), row), actions

@@ -10,14 +10,13 @@ from typing import ClassVar
 import numpy as np
 
 from sb3_combrel.common.checks import check_count
-from sb3_combrel.mappings.action_mappings import AllActionMappings
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.mappings.mapping_set import MappingSet
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates, MappingsLike
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.instances.selectors import FixedSelector
-from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer, check_action_mappings, members_of
+from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer, check_action_mappings
 from sb3_combrel.transfer.prior.copies import Copies
 from sb3_combrel.transfer.prior.copy_sums import CopySums
 from sb3_combrel.transfer.prior.prior_choice import Choice, Chooser
@@ -135,16 +134,16 @@ def squared_errors(copies: Copies, sums: CopySums) -> np.ndarray:
 
 def least_error_member(errors: np.ndarray, mappings: MappingSet) -> tuple[float, int, np.ndarray]:
     """Find the mapping with the least error, the first of equals: error, state mapping, each target action's source action."""
-    if mappings.pairs is None and isinstance(mappings.actions, AllActionMappings):
+    if mappings.combines_freely:
         # Every combination is in the set: the best source action of each target action can be found on its own.
         of_row = errors.min(axis=2).sum(axis=1)
         row = int(of_row.argmin())
         return float(of_row[row]), row, errors[row].argmin(axis=1)
     found = []
-    for rows, actions in members_of(mappings):
-        of_member = errors[rows, np.arange(errors.shape[1]), actions].sum(axis=1)
+    for rows, actions in mappings.members():
+        of_member = errors[rows[:, None], np.arange(errors.shape[1]), actions].sum(axis=1)
         best = int(of_member.argmin())
-        found.append((float(of_member[best]), int(rows[best, 0]), actions[best]))
+        found.append((float(of_member[best]), int(rows[best]), actions[best]))
     return min(found, key=lambda one: one[0])
 
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from sb3_combrel.common.checks import check_count
 from sb3_combrel.common.instances import Instances
-from sb3_combrel.mappings.action_mappings import AllActionMappings
 from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.mappings.mapping_set import MappingSet
 from sb3_combrel.transfer.base import TargetTask
@@ -17,7 +16,7 @@ from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.instances.compliance import ComplianceTable
 from sb3_combrel.transfer.instances.instance_transfer import RELEVANCE_GROWTH
 from sb3_combrel.transfer.instances.selectors import PooledSelector
-from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer, check_action_mappings, members_of
+from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer, check_action_mappings
 from sb3_combrel.transfer.prior.prior_sets import is_factored
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 
@@ -187,14 +186,14 @@ class TaskComplianceSelector(PooledSelector):
 def mean_compliances(mappings: MappingSet, sums: np.ndarray, n_transitions: int) -> np.ndarray:
     """Return sum over X of Lambda_X (Eq. 6) / n_mappings by state mapping, target and source action, as ``sums`` are."""
     n_rows, n_actions, n_source_actions = sums.shape
-    if mappings.pairs is None and isinstance(mappings.actions, AllActionMappings):
+    if mappings.combines_freely:
         # In the mean over all source actions that the other target actions may have.
         of_action = sums.mean(axis=2)
         everything: np.ndarray = sums + (of_action.sum(axis=1, keepdims=True) - of_action)[:, :, None]
         return everything / (n_transitions * n_rows * n_source_actions)
     found = np.zeros_like(sums)
-    for rows, actions in members_of(mappings):
-        members = rows, np.arange(n_actions), actions
+    for rows, actions in mappings.members():
+        members = rows[:, None], np.arange(n_actions), actions
         np.add.at(found, members, (sums[members].sum(axis=1) / (n_transitions * mappings.n_mappings))[:, None])
     return found
 

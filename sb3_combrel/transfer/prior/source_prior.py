@@ -136,11 +136,9 @@ class SourcePrior:
                 self._warned = True
                 warn_of_error(self.sources, self.n_observed, self.error())
         episode = self._episodes[self.environment]
-        if episode:
-            last_state, _, last_effect = episode[-1]
-            if np.abs(self.task.effect(state, last_state + last_effect)).max() >= SAME_STATE:
-                # Past data, or transitions that are taken in once more in other unit coordinates: episodes may be cut anywhere.
-                episode.clear()
+        if episode and np.abs(self.task.effect(state, episode[-1][0] + episode[-1][2])).max() >= SAME_STATE:
+            # Past data, or transitions that are taken in once more in other unit coordinates: episodes may be cut anywhere.
+            episode.clear()
         episode.append((state, reward, effect))
 
     def _check(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, recorded: bool) -> None:
@@ -317,10 +315,6 @@ class SourcePrior:
             "transfer/switches": self.n_switches,
             "transfer/target_transitions": self.n_observed,
         }
-
-    def describe(self) -> str:
-        """Say what each target action is made of: "East: Right on (x, vx) as (x, v), Neutral on (y, vy) as (x, v); ..."."""
-        return self.candidates.describe_choice(self.choice)
 
     def choices_by_action(self) -> np.ndarray:
         """The candidate in use for each target action, int64, shape (n_target_actions,), -1 for none."""
