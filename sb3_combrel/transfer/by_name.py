@@ -60,7 +60,9 @@ def check_argument_names(method: type, arguments: Iterable[str]) -> None:
 
 def _method(name: str) -> Any:
     module_name, _, attribute = name.replace(":", ".").rpartition(".")
-    own = _own_methods()
+    # The package's own transfer methods that are complete, by their public names.
+    own = {_name(each): each for each in _subclasses(Transfer) if each.__module__.startswith(METHODS)}
+    own = {name: each for name, each in own.items() if not inspect.isabstract(each)}
     public = _public(f"{module_name or PACKAGE}.{attribute}")
     if public in own:
         return own[public]
@@ -70,12 +72,6 @@ def _method(name: str) -> Any:
         close = did_you_mean(attribute, [each.rpartition(".")[2] for each in own])
         known = ", ".join(sorted(own))
         raise ValueError(f"transfer names {name!r}, which does not exist; known are {known}{close}") from error
-
-
-def _own_methods() -> dict[str, type[Transfer]]:
-    """The package's own transfer methods that are complete, by their public names."""
-    methods = (each for each in _subclasses(Transfer) if each.__module__.startswith(METHODS))
-    return {_name(each): each for each in methods if not inspect.isabstract(each)}
 
 
 def describe_transfer(transfer: Transfer | None) -> dict[str, Any] | None:

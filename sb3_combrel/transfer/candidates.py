@@ -94,29 +94,22 @@ class Candidates:
         self.first_row = np.cumsum([0, *(mappings.n_state_mappings for mappings in self.sets)])
         self.first_action = np.cumsum([0, *(source.n_actions for source in self.sources)])
         self.origins: list[Origin] = []
-        self._action_mappings = self._whole_mappings() if whole else []
         self.arrays = self._numbered()
 
-    def _whole_mappings(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return, for each source, the state mapping of every mapping, and its source actions, one row a mapping."""
-        n_all = sum(map(len, self.sets))
+    def _numbered(self) -> CandidateArrays:
+        n_all = sum(map(len, self.sets)) if self.whole else 0
         if n_all > MAX_WHOLE_MAPPINGS:
             raise ValueError(
                 f'mappings must hold at most {MAX_WHOLE_MAPPINGS} whole mappings with neighbors="state_action", got {n_all}; '
                 'a list of mappings or a smaller set would do, or neighbors="action", which needs no whole mappings'
             )
-        members = [zip(*mappings.members(), strict=True) for mappings in self.sets]
-        return [(np.concatenate(rows), np.concatenate(actions)) for rows, actions in members]
-
-    def _numbered(self) -> CandidateArrays:
+        members = [list(mappings.members()) if self.whole else [] for mappings in self.sets]
         first = [0]
         for a in range(self.task.n_actions):
             for number, mappings in enumerate(self.sets):
-                if self.whole:
-                    state_index, source_action = self._action_mappings[number][0], self._action_mappings[number][1][:, a]
-                else:
-                    state_index, source_action = mappings.candidates(a)
-                self.origins += [Origin(number, a, int(s), int(u)) for s, u in zip(state_index, source_action, strict=True)]
+                whole = [(rows, actions[:, a]) for rows, actions in members[number]]
+                for pairs in whole or [mappings.candidates(a)]:
+                    self.origins += [Origin(number, a, int(s), int(u)) for s, u in zip(*pairs, strict=True)]
             first.append(len(self.origins))
         source, _, state_index, source_action = np.array(self.origins, dtype=np.int64).T
         row, action = self.first_row[source] + state_index, self.first_action[source] + source_action
@@ -142,13 +135,15 @@ class Candidates:
     def parts(self, candidate: int) -> Candidate:
         """Return a candidate's parts, by name."""
         number, action, state_index, source_action = self.origins[candidate]
-        whole = repr(self.sets[number][self.sets[number].find(state_index, action, source_action)])
-        variables = whole[whole.index("(") + 1 : whole.index(";")]
-        names, whole_actions = self.sources[number].action_names, []
+        mappings, names = self.sets[number], self.sources[number].action_names
         if self.whole:
-            place = candidate - self.arrays.first[action] - sum(map(len, self.sets[:number]))
-            whole_actions = self._action_mappings[number][1][place]
-        return Candidate(action, names[source_action], variables, tuple(names[each] for each in whole_actions))
+            mapping = mappings[candidate - int(self.arrays.first[action]) - sum(map(len, self.sets[:number]))]
+        else:
+            mapping = mappings[mappings.find(state_index, action, source_action)]
+        words = repr(mapping)
+        variables = words[words.index("(") + 1 : words.index(";")]
+        whole_actions = tuple(names[each] for each in mapping.action) if self.whole else ()
+        return Candidate(action, names[source_action], variables, whole_actions)
 
     def mapped_variables(self, candidate: int) -> MappedVariables:
         """Return what a candidate makes of each target variable, in numbers."""

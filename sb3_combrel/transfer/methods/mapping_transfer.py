@@ -31,8 +31,6 @@ from sb3_combrel.transfer.prior.source_prior import SourcePrior
 from sb3_combrel.transfer.report import TransferReport
 from sb3_combrel.transfer.source_model import DEFAULT_SOURCE_BREADTH
 
-#: What is done with the source once bound, as ``use`` says.
-SourceUse = InstanceTransfer | SourcePrior
 DEFAULT_BREADTH = 0.3
 DEFAULT_BREADTH_DECAY = 0.8
 NEAR = "near"  #: the relevance that does not favour distant instances, ``equations.near_relevances``
@@ -134,7 +132,9 @@ class MappingTransfer(Transfer):
         if self._left_open:
             self.use, self._left_open = "prior" if task.takes_prior else "instances", {}
         self.source, self.mappings = loaded(self.source, self.mappings, task)
-        self._source_use: SourceUse = self._make_prior(task) if self.use == "prior" else self._make_instances(task)
+        # What is done with the source, as ``use`` says.
+        self._source_use: InstanceTransfer | SourcePrior
+        self._source_use = self._make_prior(task) if self.use == "prior" else self._make_instances(task)
 
     def _make_instances(self, task: TargetTask) -> InstanceTransfer:
         self.candidates = Candidates(self.source, self.mappings, task, self._whole_mappings())

@@ -68,7 +68,10 @@ def make_prior(
     else:
         candidates = Candidates(source, mappings, task)
         copies = copies_of(candidates, breadth)
-        allowed = _allowed(candidates, copies)
+        # Which state mapping and source action the set has for each target action, see ``best_actions``.
+        allowed = np.zeros((len(copies), task.n_actions, copies.most_actions), dtype=np.bool_)
+        _, target_action, _, source_action = np.array(candidates.origins).T
+        allowed[candidates.arrays.row, target_action, source_action] = True
         choose = draw_mapping(allowed, drawn) if drawn else partial(choose_mapping, copies, allowed=allowed)
     return SourcePrior(
         copies,
@@ -159,11 +162,3 @@ def copies_of(candidates: Candidates, breadth: float) -> Copies:
     """Return all state mappings of a set, for each source, in the order of the candidates' mapping table."""
     number = np.repeat(np.arange(len(candidates.sets)), [each.n_state_mappings for each in candidates.sets])
     return Copies(candidates.sources, number, *candidates.table, breadth)
-
-
-def _allowed(candidates: Candidates, copies: Copies) -> np.ndarray:
-    """Which state mapping and source action a set has for each target action: see ``best_actions``."""
-    allowed = np.zeros((len(copies), candidates.task.n_actions, copies.most_actions), dtype=np.bool_)
-    _, target_action, _, source_action = np.array(candidates.origins).T
-    allowed[candidates.arrays.row, target_action, source_action] = True
-    return allowed

@@ -337,22 +337,19 @@ class SourcePrior:
             for row, array in zip(chosen[1:], (*self.choice, *self.bounding), strict=True):
                 row[:, : array.shape[1]] = array
         figures = self.n_observed, self.n_switches, self.version, self._renewal_due, self._warned, n_slots, self.explains
+        # Environment, state, reward and effect of each transition of the present episodes.
+        episodes = [[e, *state, reward, *effect] for e, episode in self._episodes.items() for state, reward, effect in episode]
         return {
             "transitions": self.transitions.rows(),
             "prior_choice": chosen.ravel(),
             "prior_evidence": np.append(self.evidence.get_state(), self.excess),
-            "prior_episodes": self._episode_rows(),
+            "prior_episodes": np.array(episodes, dtype=np.float64).reshape(-1, 2 * self.task.n_variables + 2),
             "prior_figures": np.array(figures, dtype=np.float64),
             "prior_errors": self.errors.sums.ravel().copy(),
             "prior_uses": self.candidates.get_state(),
             "prior_history": self.history.get_state(),
             **{f"prior_sums_{name}": array.ravel().copy() for name, array in self.sums._asdict().items()},
         }
-
-    def _episode_rows(self) -> np.ndarray:
-        """Environment, state, reward and effect of the present episodes, float64, shape (n, 2 * n_variables + 2)."""
-        rows = [[e, *state, reward, *effect] for e, episode in self._episodes.items() for state, reward, effect in episode]
-        return np.array(rows, dtype=np.float64).reshape(-1, 2 * self.task.n_variables + 2)
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         d, n_actions = self.task.n_variables, self.task.n_actions

@@ -71,13 +71,9 @@ class ValueBound:
         states, returns, to_go = np.array([state for state, *_ in episode]), np.zeros(len(episode)), 0.0
         for i in range(len(episode) - 1, -1, -1):
             returns[i] = to_go = episode[i][1] + self._gamma * to_go
-        bounds = np.minimum.reduce([self._bound_in_cells(copy, states) for copy in choice.same_copies()])
+        seen = [self._seen_by(copy, states) for copy in choice.same_copies()]
+        bounds = np.minimum.reduce([of.values[of.mdp.grid.cells_around(at)].max(axis=1) for of, at in seen])
         return float((returns - bounds).max(initial=0.0))
-
-    def _bound_in_cells(self, copy: int, states: np.ndarray) -> np.ndarray:
-        """The largest of the source's values around what each state is in a copy."""
-        planner, at = self._seen_by(copy, states)
-        return np.asarray(planner.values[planner.mdp.grid.cells_around(at)].max(axis=1))
 
     def _costs_are_alike(self, used: list[int]) -> bool:
         rewards = np.concatenate([self._copies.sources[self._copies.source[copy]].rewards for copy in used])
