@@ -42,16 +42,14 @@ class MappedVariables(NamedTuple):
     action: np.ndarray  #: source action that moves the variable; -1 for none
 
     @classmethod
-    def none(cls, target_action: int, n_variables: int) -> MappedVariables:
-        """No variable is mapped."""
-        none = np.full(n_variables, -1, dtype=np.int64)
-        return cls(target_action, none, none.copy(), np.zeros_like(none), none.copy())
-
-    def map(self, source: int, variable: np.ndarray, sign: np.ndarray, action: int) -> None:
-        """Write what the variables with a source variable (not -1) are mapped to, and the source action that moves them."""
-        mapped = variable >= 0
-        self.source[mapped], self.action[mapped] = source, action
-        self.variable[mapped], self.sign[mapped] = variable[mapped], np.where(sign[mapped] < 0, -1, 1)
+    def of(cls, target_action: int, parts: Sequence[tuple[int, np.ndarray, np.ndarray, int]], n: int) -> MappedVariables:
+        """Take ``n`` variables from parts: source task, source variables (-1 for none), signs, and the source action."""
+        source, variable, action, sign = *np.full((3, n), -1, dtype=np.int64), np.zeros(n, dtype=np.int64)
+        for number, read, its_sign, used in parts:
+            mapped = read >= 0
+            source[mapped], variable[mapped], action[mapped] = number, read[mapped], used
+            sign[mapped] = np.where(its_sign[mapped] < 0, -1, 1)
+        return cls(target_action, source, variable, sign, action)
 
 
 class Origin(NamedTuple):
@@ -148,9 +146,8 @@ class Candidates:
     def mapped_variables(self, candidate: int) -> MappedVariables:
         """Return what a candidate makes of each target variable, in numbers."""
         origin, row = self.origins[candidate], self.arrays.row[candidate]
-        found = MappedVariables.none(origin.target_action, self.task.n_variables)
-        found.map(origin.source, self.table.variable[row], self.table.sign[row], origin.source_action)
-        return found
+        part = origin.source, self.table.variable[row], self.table.sign[row], origin.source_action
+        return MappedVariables.of(origin.target_action, [part], self.task.n_variables)
 
     def describe(self, candidate: int) -> str:
         """Return target action, source action and pairs of variables of a candidate as text."""

@@ -58,11 +58,9 @@ class PriorCandidates:
         return Candidate(action, names, " + ".join(describe_copy(self.mapping(copy)) for copy, _ in moves))
 
     def mapped_variables(self, candidate: int) -> MappedVariables:
-        action, moves = self.made_of(candidate)
-        found = MappedVariables.none(action, self.task.n_variables)
-        for copy, used in moves:
-            found.map(self.copies.source[copy], self.copies.state[copy], self.copies.sign[copy], used)
-        return found
+        (action, moves), of = self.made_of(candidate), self.copies
+        parts = [(int(of.source[copy]), of.state[copy], of.sign[copy], used) for copy, used in moves]
+        return MappedVariables.of(action, parts, self.task.n_variables)
 
     def describe(self, candidate: int) -> str:
         parts = self.parts(candidate)
