@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from copy import copy
 from operator import index as as_index
-from typing import Any, NamedTuple, Unpack
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -45,13 +45,6 @@ _SETS: dict[str, tuple[bool, bool, type[AllActionMappings | BalancedActionMappin
 _SIZED_SETS = (*_SETS, *(f"signed_{each}" for each in _SETS))
 _PAPER_SETS = ("paper_mountain_car", "paper_icub")
 FACTORED_SETS = ("factored", "signed_factored")
-
-
-class Candidates(NamedTuple):
-    """The different ways in which the mappings of a set treat one target action; compliance distinguishes no others."""
-
-    state_index: Ints  # row of ``MappingSet.state_mappings``, shape (n_candidates,)
-    source_action: Ints  # that the target action maps to, same shape
 
 
 class MappingSet:
@@ -304,21 +297,21 @@ class MappingSet:
         self._check_action(action)
         return self.actions.source_actions_for(action) if self.pairs is None else np.unique(self._source_actions[:, action])
 
-    def candidates(self, action: int) -> Candidates:
+    def candidates(self, action: int) -> tuple[Ints, Ints]:
         """The different pairs of a state mapping and the source action that a target action maps to.
 
         All mappings with the same pair translate the same source instances in the same way for this target action, so
         compliance (Eq. 5) need be computed for these pairs only. Of state mappings that are equal only the first is listed.
 
-        :return: the pairs, ordered by state mapping and source action
+        :return: rows of ``state_mappings``, and source actions, shape (n_candidates,) each; in ascending order
         :raises ValueError: if there is no such target action
         """
         source_actions = self.source_actions_for(action)
         if self.pairs is None:
             rows = np.unique(self._first_equal)
-            return Candidates(np.repeat(rows, len(source_actions)), np.tile(source_actions, len(rows)))
+            return np.repeat(rows, len(source_actions)), np.tile(source_actions, len(rows))
         different = np.unique(np.column_stack([self._states, self._source_actions[:, action]]), axis=0)
-        return Candidates(different[:, 0].copy(), different[:, 1].copy())
+        return different[:, 0].copy(), different[:, 1].copy()
 
     def find(self, state_index: int, action: int, source_action: int) -> int:
         """The first mapping with this state mapping (or an equal one) that maps ``action`` to ``source_action``.

@@ -95,7 +95,7 @@ class TestPaperSets:
         mapping_set = MappingSet.paper_mountain_car()
         assert (mapping_set.n_state_mappings, mapping_set.n_action_mappings, len(mapping_set)) == (24, 90, 2160)
         assert len(set(mapping_set)) == 1080 and set(mapping_set) == set(MappingSet.balanced(**MOUNTAIN_CAR))
-        assert len(mapping_set.candidates(0).state_index) == 12 * 3
+        assert len(mapping_set.candidates(0)[0]) == 12 * 3
         # Table 2: Left, Neutral, Right are source actions 1, 0, 2.
         table = "LLRNR LNRNR RNLRL RLLRN LNLRR NLRLR RNRLL LNRRN LNRRL".split()
         actions = {mapping_set.actions[i] for i in range(90)}
