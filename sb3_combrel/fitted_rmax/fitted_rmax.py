@@ -313,7 +313,7 @@ class FittedRMax(PastData):
         callback.on_training_start(locals(), globals())
         callback.on_rollout_start()
         self._episode_rewards = [[] for _ in range(self.n_envs)]
-        self._last_states = self.policy.note(np.asarray(self._last_obs))
+        self._last_states = self.policy.to_unit(np.asarray(self._last_obs), note=True)
         if begins_anew:
             self.agent.break_off()
         self.agent.prepare()
@@ -325,7 +325,7 @@ class FittedRMax(PastData):
         finally:
             self._last_states = None
             callback.on_training_end()
-        self.policy.to_unit.warn_of_share(self.policy.scales.observed, self.agent.task.state_names)
+        self.policy.scales.warn_of_share(self.agent.task.state_names)
         return self
 
     def _refuse_changes(self) -> None:
@@ -361,12 +361,12 @@ class FittedRMax(PastData):
         raw_rewards = self._raw_rewards(rewards)
         ended = [e for e, done in enumerate(dones.tolist()) if done]
         next_obs, terminated = true_outcomes(new_obs, infos, ended)
-        next_states = self.policy.note(next_obs)
+        next_states = self.policy.to_unit(next_obs, note=True)
         for e, choice in enumerate(choices):
             self.agent.update(states[e], choice, raw_rewards[e], next_states[e], terminated[e], e)
             self._episode_rewards[e].append(raw_rewards[e])
         self._last_obs = new_obs  # type: ignore[assignment]
-        self._last_states = self.policy.note(np.asarray(new_obs)) if ended else next_states
+        self._last_states = self.policy.to_unit(np.asarray(new_obs), note=True) if ended else next_states
         self._last_episode_starts = dones
         callback.update_locals(locals())
         try:

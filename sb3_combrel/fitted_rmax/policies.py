@@ -11,19 +11,14 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
-from sb3_combrel.common.observations import ObservationScaler
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task
-from sb3_combrel.common.user_warnings import warn_user
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.fitted_rmax.scales import FoundScales
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 from sb3_combrel.models.base import Model
 from sb3_combrel.transfer.base import Transfer
 from sb3_combrel.transfer.by_name import describe_transfer, restore_transfer
-
-# With so many instances an observation that makes a scale wider by more than this is a surprise.
-MANY_INSTANCES, MANY_RANGES = 100, 20
 
 
 class FittedRMaxPolicy(BasePolicy):
@@ -62,24 +57,16 @@ class FittedRMaxPolicy(BasePolicy):
         states, actions = (() if names is None else names for names in (state_names, action_names))
         task = Task(self.scales.scaling, int(action_space.n), states, actions, self.scales.bounds, self.scales.are_given)
         self.agent = FittedRMaxAgent(given, task, restore_transfer(transfer), rng, model_class)
-        self._renew_to_unit()
+        #: Observations, raw units, to unit coordinates.
+        self.to_unit = self.scales.to_unit
         self._first_action = int(action_space.start)
         self._settings = settings
         self._model_class = model_class
-        self._warned_beyond_space = self._warned_far = False
-
-    def _renew_to_unit(self) -> None:
-        #: Observations, raw units, to unit coordinates; what is outside fixed bounds is moved to the boundary, or wrapped.
-        self.to_unit = ObservationScaler(self.scaling, self.agent.periodic, self.scales.fixed)
 
     @property
     def scaling(self) -> StateScaling:
         """Raw <-> unit coordinates."""
         return self.scales.scaling
-
-    def note(self, observations: np.ndarray) -> np.ndarray:
-        """Unit coordinates of observations of learning, which may ask for other scales (see :meth:`follow_scales`)."""
-        return self.to_unit(observations, self.scales.observed)
 
     def take_in(
         self, states: np.ndarray, actions: np.ndarray, rewards: np.ndarray, next_states: np.ndarray, terminated: np.ndarray
@@ -90,7 +77,7 @@ class FittedRMaxPolicy(BasePolicy):
         rewards = rewards.astype(np.float32).astype(np.float64)
         try:
             for observations in (states, next_states):
-                self.note(observations)
+                self.to_unit(observations, note=True)
             self.follow_scales(episode_ended=True)
             each = self.to_unit(states), actions.tolist(), rewards.tolist(), self.to_unit(next_states), terminated.tolist()
             self.agent.take_in(list(zip(*each, strict=True)))
@@ -101,48 +88,19 @@ class FittedRMaxPolicy(BasePolicy):
 
     def follow_scales(self, episode_ended: bool) -> bool:
         """Compute all anew in other unit coordinates if the observations so far ask for that; whether they do."""
-        if self.scales.fixed or not (episode_ended or self.to_unit.went_beyond):
+        if self.scales.fixed or not (episode_ended or self.scales.went_beyond):
             return False
         # No other thread may see new scales with old instances.
         with self.agent.lock:
             before, scaling = self.scaling, self.scales.renewed(episode_ended, self.agent.transfers)
             if scaling is not None:
                 try:
-                    self._warn_beyond_space()
-                    self._warn_of_far_observation(before)
+                    self.scales.warn_of_surprises(before, self.agent.task.state_names, self.agent.model.n_instances)
                     self.agent.rescale(scaling, self.scales.bounds)
                 except BaseException:
                     self.scales.scaling = self.agent.task.scaling
                     raise
-                finally:
-                    self._renew_to_unit()
         return scaling is not None
-
-    def _warn_beyond_space(self) -> None:
-        beyond = np.flatnonzero(self.scales.beyond_space()).tolist()
-        if self._warned_beyond_space or not beyond:
-            return
-        self._warned_beyond_space = True
-        least, most, names = *self.scales.observed, self.agent.task.state_names
-        seen = ", ".join(f"{names[k]} from {least[k]:.4g} to {most[k]:.4g}" for k in beyond)
-        space = ", ".join(f"from {self.scales.low[k]:.4g} to {self.scales.high[k]:.4g}" for k in beyond)
-        warn_user(
-            f"observations are outside the observation space: {seen}, but the space says {space}; they are taken as they are"
-        )
-
-    def _warn_of_far_observation(self, before: StateScaling) -> None:
-        wider = self.scales.widened(before)
-        k = int(wider.argmax())
-        if self._warned_far or self.agent.model.n_instances < MANY_INSTANCES or wider[k] <= MANY_RANGES:
-            return
-        self._warned_far = True
-        least, most = self.scales.observed[:, k]
-        name, value = self.agent.task.state_names[k], least if before.low[k] - least > most - before.high[k] else most
-        warn_user(
-            f"{name}={value:.4g} is far from all observations before, from {before.low[k]:.4g} to {before.high[k]:.4g}, and "
-            "variables without bounds are scaled by the range of what is observed: if it is an error of a sensor, mend it in "
-            "the environment, or pass bounds=(low, high)"
-        )
 
     @property
     def transfer(self) -> Any:
@@ -217,7 +175,6 @@ class FittedRMaxPolicy(BasePolicy):
                 # The user gives other bounds than those of the file.
                 self.scales.scaling = fixed
                 self.agent.rescale(fixed, fixed)
-                self._renew_to_unit()
 
     def _replace_learned(self, arrays: dict[str, np.ndarray]) -> None:
         """Take over what :meth:`_learned` returned, in place of what was learned."""
@@ -225,7 +182,6 @@ class FittedRMaxPolicy(BasePolicy):
         with self.agent.lock:
             self.scales.set_state(arrays["scales"])
             self.agent.set_state(of_agent, self.scales.scaling, self.scales.bounds)
-            self._renew_to_unit()
 
 
 def _misfit(name: str, tensor: Any, expected: np.ndarray) -> str:

@@ -13,6 +13,7 @@ import warnings
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import config, njit
@@ -22,9 +23,10 @@ from sb3_combrel.common import compiled
 from sb3_combrel.common.compiled import EntryPoint, remove_outdated
 from sb3_combrel.common.instances import BLOCK
 from sb3_combrel.common.kernels import any_periodic, measure_gaps, squared_distance
-from sb3_combrel.common.observations import ObservationScaler, scale_into_box
+from sb3_combrel.common.observations import scale_into_box
 from sb3_combrel.common.periodic import difference, differences, periodic_flags
 from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.fitted_rmax.scales import FoundScales
 
 MESSAGE = "sb3_combrel: compiling"
 # Learns with and without a source, and prints compiled functions of the package that have a version for a constant.
@@ -219,7 +221,7 @@ def test_no_instance_is_nearer_than_the_box_of_its_block(seed, d):
 @repeatable
 @given(st.floats(-50.0, 50.0), st.integers(-3, 3))
 def test_an_angle_is_wrapped_without_a_warning(angle, turns):
-    scale = ObservationScaler(ANGLE_AND_SPEED, [True, False])
+    scale = FoundScales(spaces.Box(-9.0, 9.0, (2,)), (ANGLE_AND_SPEED.low, ANGLE_AND_SPEED.high), [True, False]).to_unit
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         unit = scale(np.array([angle + 2 * np.pi * turns, 0.0]))
@@ -229,7 +231,7 @@ def test_an_angle_is_wrapped_without_a_warning(angle, turns):
 
 
 def test_what_is_not_periodic_is_moved_to_the_boundary_with_a_warning_and_what_is_not_finite_is_refused():
-    scale = ObservationScaler(ANGLE_AND_SPEED, [True, False])
+    scale = FoundScales(spaces.Box(-9.0, 9.0, (2,)), (ANGLE_AND_SPEED.low, ANGLE_AND_SPEED.high), [True, False]).to_unit
     with pytest.warns(UserWarning, match="outside the bounds"):
         np.testing.assert_allclose(scale(np.array([[1.5 * np.pi, 9.0]])), [[0.25, 1.0]])
     for wrong in (np.nan, np.inf, -np.inf):
