@@ -5,8 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_combrel.common.compiled import entry_point
-
 ROUNDING = 1e-9
 
 
@@ -83,29 +81,41 @@ _TYPES = tuple(map(np.dtype, (np.int64, np.float64, np.float64, np.float64, np.b
 def check_transferred(
     given: TransferredInstances, method: object, own_weight: np.ndarray, n_variables: int, threshold: float
 ) -> None:
-    """Check what a transfer method returned before compiled code reads it.
+    """Check what a transfer method returned before compiled code reads it; the first row that is wrong is named.
 
     :param own_weight: of the target's own instances of each pair that was asked for, shape (n,)
     :param threshold: weight that own and transferred instances of a pair must reach together
     :raises ValueError: if rows are missing, arrays have other types or shapes, a value is not finite, a weight is not above
         0, or the weights of a pair do not reach the threshold
     """
-    name = type(method).__name__
-    _check_arrays(given, name, len(own_weight), n_variables)
-    problem, row = first_problem.call(given, own_weight, threshold)
-    if problem == _NO_PROBLEM:
-        return
-    length, weights = int(given.length[row]), given.weight[row, : max(0, given.length[row])]
-    raise ValueError(
-        {
-            _LENGTH: f"{name} returned length={length} for row {row}; it must be from 0 to {given.weight.shape[1]}, "
-            "the room in weight",
-            _WEIGHT: f"{name} returned the weights {weights} for row {row}; they must be finite and above 0",
-            _VALUE: f"{name} returned an effect or a reward that is not finite for row {row}",
-            _THRESHOLD: f"{name} returned weights that add up to {weights.sum():g} for row {row}, with {own_weight[row]:g} of "
-            f"the target's own instances; together they must reach the threshold of {threshold:g}, or length must be 0",
-        }[problem]
+    name, n = type(method).__name__, len(own_weight)
+    _check_arrays(given, name, n, n_variables)
+    length, room = given.length[:n], given.weight.shape[1]
+    used = np.arange(room) < length[:, None]
+    weight = np.where(used, given.weight[:n], 0.0)
+    total = own_weight + weight.sum(axis=1)
+    weighed = ((weight > 0.0) & (weight < np.inf)) | ~used
+    finite = (np.isfinite(given.reward[:n]) & np.isfinite(given.effect[:n]).all(axis=2)) | ~used
+    problems = np.stack(
+        [
+            (length < 0) | (length > room),
+            ~weighed.all(axis=1),
+            ~finite.all(axis=1),
+            (length > 0) & (total < threshold * (1.0 - ROUNDING)),
+        ]
     )
+    if not problems.any():
+        return
+    row = int(problems.any(axis=0).argmax())
+    weights = given.weight[row, : max(0, length[row])]
+    messages = (
+        f"length={length[row]} for row {row}; it must be from 0 to {room}, the room in weight",
+        f"the weights {weights} for row {row}; they must be finite and above 0",
+        f"an effect or a reward that is not finite for row {row}",
+        f"weights that add up to {weights.sum():g} for row {row}, with {own_weight[row]:g} of the target's own instances; "
+        f"together they must reach the threshold of {threshold:g}, or length must be 0",
+    )
+    raise ValueError(f"{name} returned {messages[problems[:, row].argmax()]}")
 
 
 def _check_arrays(given: TransferredInstances, name: str, n: int, n_variables: int) -> None:
@@ -127,29 +137,3 @@ def _check_arrays(given: TransferredInstances, name: str, n: int, n_variables: i
             )
     if shape[0] < n:
         raise ValueError(f"{name} returned {shape[0]} rows, but was asked for {n}")
-
-
-_NO_PROBLEM, _LENGTH, _WEIGHT, _VALUE, _THRESHOLD = range(5)
-
-
-@entry_point
-def first_problem(given, own_weight, threshold):
-    """What is wrong with the first row that breaks the contract, and its number."""
-    for row in range(len(own_weight)):
-        n = given.length[row]
-        if n < 0 or n > given.weight.shape[1]:
-            return _LENGTH, row
-        total = own_weight[row]
-        for k in range(n):
-            weight = given.weight[row, k]
-            if not (weight > 0.0 and weight < np.inf):
-                return _WEIGHT, row
-            total += weight
-            fine = np.isfinite(given.reward[row, k])
-            for v in range(given.effect.shape[2]):
-                fine = fine and np.isfinite(given.effect[row, k, v])
-            if not fine:
-                return _VALUE, row
-        if n > 0 and total < threshold * (1.0 - ROUNDING):
-            return _THRESHOLD, row
-    return _NO_PROBLEM, 0
