@@ -11,8 +11,6 @@ machine only.
 import gc
 import hashlib
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -82,8 +80,14 @@ class EntryPoint:
 
     def _first_call(self, *arguments: Any) -> Any:
         _remove_outdated_once()
-        with _compilation():
-            result = self.function(*arguments)
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            with event.install_listener("numba:compile", _announcement):
+                result = self.function(*arguments)
+        finally:
+            if collects:
+                gc.enable()
         self.call = self.function
         return result
 
@@ -111,16 +115,3 @@ class _Announcement(event.Listener):
 
 
 _announcement = _Announcement()
-
-
-@contextmanager
-def _compilation() -> Iterator[None]:
-    """Listen to the compiler and hold garbage collection back, for the time of one call only."""
-    collects = gc.isenabled()
-    gc.disable()
-    try:
-        with event.install_listener("numba:compile", _announcement):
-            yield
-    finally:
-        if collects:
-            gc.enable()
