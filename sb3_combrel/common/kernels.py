@@ -28,25 +28,6 @@ def squared_distance(state, other, periodic, wraps):
     return distance
 
 
-@inlined
-def measure_gaps(state, low, high, periodic, n_blocks, gap):
-    """Squared distances from a state to boxes, variable by variable: many boxes at once in vector registers."""
-    gap[:n_blocks] = 0.0
-    for k in range(len(state)):
-        at = state[k]
-        low_k = low[k]
-        high_k = high[k]
-        if periodic[k]:
-            measure_gaps_around(at - np.floor(at), low_k, high_k, n_blocks, gap)
-            continue
-        for block in range(n_blocks):
-            below = low_k[block] - at
-            above = at - high_k[block]
-            outside = below if below > above else above
-            outside = outside if outside > 0.0 else 0.0
-            gap[block] += outside * outside
-
-
 @compiled
 def measure_gaps_around(at, low, high, n_blocks, gap):
     """Add the squared distances along one periodic variable: a box is as far as its nearer end, on either way around."""
@@ -61,10 +42,27 @@ def measure_gaps_around(at, low, high, n_blocks, gap):
 
 
 @compiled
-def measure_blocks(instances, action, at):
-    """Measure how far the blocks of an action's instances are; how many blocks there are."""
+def measure_blocks(instances, action, state):
+    """Squared distances from a state to the boxes of an action's blocks, into :attr:`Instances.gap`; how many there are.
+
+    Variable by variable: many boxes at once in vector registers.
+    """
     n_blocks = (instances.size[action] + BLOCK - 1) // BLOCK
-    measure_gaps(at, instances.block_low[action], instances.block_high[action], instances.periodic, n_blocks, instances.gap)
+    gap = instances.gap
+    gap[:n_blocks] = 0.0
+    for k in range(len(state)):
+        at = state[k]
+        low = instances.block_low[action, k]
+        high = instances.block_high[action, k]
+        if instances.periodic[k]:
+            measure_gaps_around(at - np.floor(at), low, high, n_blocks, gap)
+            continue
+        for block in range(n_blocks):
+            below = low[block] - at
+            above = at - high[block]
+            outside = below if below > above else above
+            outside = outside if outside > 0.0 else 0.0
+            gap[block] += outside * outside
     return n_blocks
 
 

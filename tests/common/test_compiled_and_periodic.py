@@ -21,8 +21,8 @@ from numba.core.errors import TypingError
 
 from sb3_combrel.common import compiled
 from sb3_combrel.common.compiled import EntryPoint, remove_outdated
-from sb3_combrel.common.instances import BLOCK
-from sb3_combrel.common.kernels import any_periodic, measure_gaps, squared_distance
+from sb3_combrel.common.instances import BLOCK, Instances
+from sb3_combrel.common.kernels import any_periodic, measure_blocks, squared_distance
 from sb3_combrel.common.observations import scale_into_box
 from sb3_combrel.common.periodic import difference, differences, periodic_flags
 from sb3_combrel.common.scaling import StateScaling
@@ -174,11 +174,6 @@ def squared_distance_of(a, b, periodic):
     return squared_distance(a, b, periodic, any_periodic(periodic))
 
 
-@njit
-def gaps_of(state, low, high, periodic, n_blocks, gap):
-    measure_gaps(state, low, high, periodic, n_blocks, gap)
-
-
 @repeatable
 @given(coordinates, coordinates)
 def test_a_difference_goes_the_short_way_around_a_period_of_1(a, b):
@@ -202,10 +197,12 @@ def test_no_instance_is_nearer_than_the_box_of_its_block(seed, d):
     periodic, n_blocks = rng.random(d) < 0.7, 4
     states = rng.uniform(0.0, 1.0, d) + rng.normal(0.0, 0.3, (n_blocks, BLOCK, d))
     states = np.where(periodic, states % 1.0, states)
-    low, high = (np.ascontiguousarray(edge(states, axis=1).T) for edge in (np.min, np.max))
-    gap = np.empty(n_blocks)
+    low, high = (edge(states, axis=1).T for edge in (np.min, np.max))
+    n = n_blocks * BLOCK
+    rows = np.zeros(n, dtype=np.int64), states.reshape(n, d), np.zeros((n, d)), np.zeros(n), np.zeros(n, dtype=np.bool_)
+    instances = Instances.of_rows(1, *rows, periodic)
     for state in rng.uniform(-1.0, 2.0, (5, d)):
-        gaps_of(state, low, high, periodic, n_blocks, gap)
+        assert measure_blocks(instances, 0, state) == n_blocks
         for block in range(n_blocks):
             # The box, point by point along each variable: the sum of the least squares is its distance.
             apart = []
@@ -213,9 +210,9 @@ def test_no_instance_is_nearer_than_the_box_of_its_block(seed, d):
                 inside = np.linspace(low[k, block], high[k, block], 501)
                 turns = range(-3, 4) if periodic[k] else (0,)
                 apart.append(min(np.abs(state[k] - inside - turn).min() for turn in turns))
-            assert gap[block] == pytest.approx(np.square(apart).sum(), abs=5e-3)
+            assert instances.gap[block] == pytest.approx(np.square(apart).sum(), abs=5e-3)
             nearest = min(squared_distance_of(state, one, periodic) for one in states[block])
-            assert gap[block] <= nearest + 1e-12
+            assert instances.gap[block] <= nearest + 1e-12
 
 
 @repeatable
