@@ -7,8 +7,10 @@ from numbers import Integral, Real
 import numpy as np
 
 
-def check_positive(name: str, value: object, *, max: float = float("inf")) -> None:
-    """:raises ValueError: unless ``value`` is a number above 0 and not above ``max``"""
+def check_positive(name: str, value: object, *, max: float = float("inf"), none_allowed: bool = False) -> None:
+    """:raises ValueError: unless ``value`` is a number above 0 and not above ``max`` (or None, where that is allowed)"""
+    if value is None and none_allowed:
+        return
     if isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) <= max or not math.isfinite(value):
         limit = "" if max == float("inf") else f" and at most {max:g}"
         raise ValueError(f"{name} must be a number above 0{limit}, got {value!r}")

@@ -45,16 +45,13 @@ class FittedRMaxSettings:
     def __post_init__(self) -> None:
         if isinstance(self.degree, bool) or not isinstance(self.degree, Integral) or self.degree not in MODELS:
             raise ValueError(f"degree must be 0 (kernel average) or 1 (local linear), got {self.degree!r}")
-        if self.model_breadth is not None:
-            check_positive("model_breadth", self.model_breadth)
+        check_positive("model_breadth", self.model_breadth, none_allowed=True)
         check_count("n_neighbors", self.n_neighbors, min=2, max=MAX_NEIGHBORS, none_allowed=True)
         check_positive("outcome_breadth", self.outcome_breadth)
         check_positive("min_fraction", self.min_fraction, max=1.0)
-        if self.min_weight is not None:
-            check_positive("min_weight", self.min_weight, max=0.99)
+        check_positive("min_weight", self.min_weight, max=0.99, none_allowed=True)
         check_positive("exploration_threshold", self.exploration_threshold)
-        if self.gamma is not None:
-            check_positive("gamma", self.gamma, max=1.0)
+        check_positive("gamma", self.gamma, max=1.0, none_allowed=True)
         check_positive("planning_tolerance", self.planning_tolerance)
         if self.max_value is not None:
             check_finite("max_value", self.max_value)
@@ -68,19 +65,15 @@ class FittedRMaxSettings:
     def model_settings(self, n_variables: int) -> ModelSettings:
         """What a model of a task with so many state variables needs of them."""
         return ModelSettings(
-            model_breadth=float(_or(self.model_breadth, _by_number(DEFAULT_BREADTHS[self.degree], n_variables))),
-            min_weight=float(_or(self.min_weight, DEFAULT_MIN_WEIGHTS[self.degree])),
+            model_breadth=float(_default(self.model_breadth, DEFAULT_BREADTHS[self.degree], n_variables)),
+            min_weight=float(DEFAULT_MIN_WEIGHTS[self.degree] if self.min_weight is None else self.min_weight),
             min_fraction=float(self.min_fraction),
             exploration_threshold=float(self.exploration_threshold),
             max_instances=self.max_instances,
-            n_neighbors=int(_or(self.n_neighbors, _by_number(DEFAULT_NEIGHBORS, n_variables))),
+            n_neighbors=int(_default(self.n_neighbors, DEFAULT_NEIGHBORS, n_variables)),
             outcome_breadth=float(self.outcome_breadth),
         )
 
 
-def _by_number(defaults: Sequence[float], n_variables: int) -> float:
-    return defaults[min(n_variables, len(defaults)) - 1]
-
-
-def _or(value: float | None, default: float) -> float:
-    return default if value is None else value
+def _default(given: float | None, defaults: Sequence[float], n_variables: int) -> float:
+    return defaults[min(n_variables, len(defaults)) - 1] if given is None else given
