@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_combrel.common.constants import TOO_WIDE
-
-if TYPE_CHECKING:
-    from gymnasium import spaces
 
 Bounds = tuple[ArrayLike, ArrayLike]
 Limits = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -154,18 +152,16 @@ def _check_order(low: NDArray[np.float64], high: NDArray[np.float64], name: str)
 
 def _count_variables(space: spaces.Space[Any]) -> int:
     """Number of variables of a one-dimensional continuous box; anything else is refused."""
-    from gymnasium import spaces as gym_spaces
-
     wanted = "the observation space must be a one-dimensional Box of floating-point numbers"
-    if isinstance(space, gym_spaces.Dict | gym_spaces.Tuple):
-        raise ValueError(f"{wanted}, got {space}; flatten it first, for example with gymnasium.wrappers.FlattenObservation")
-    if not isinstance(space, gym_spaces.Box):
+    flatten = "flatten it first, for example with gymnasium.wrappers.FlattenObservation"
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        raise ValueError(f"{wanted}, got {space}; {flatten}")
+    if not isinstance(space, spaces.Box):
         remedy = "numbers of states say nothing of which are alike: give the variables that they stand for"
         raise ValueError(f"{wanted}, got {space}; {remedy}, with gymnasium.wrappers.TransformObservation or a wrapper")
     if len(space.shape) != 1 or space.shape[0] == 0:
-        flat = "; flatten it first, for example with gymnasium.wrappers.FlattenObservation"
-        images = "; images are not supported: pass a vector of state variables" if len(space.shape) == 3 else flat
-        raise ValueError(f"{wanted}, got shape {space.shape}{images}")
+        remedy = "images are not supported: pass a vector of state variables" if len(space.shape) == 3 else flatten
+        raise ValueError(f"{wanted}, got shape {space.shape}; {remedy}")
     if not np.issubdtype(space.dtype, np.floating):
         raise ValueError(f"{wanted}, got dtype {space.dtype}; convert it, as by gymnasium.wrappers.DtypeObservation")
     return int(space.shape[0])
