@@ -30,14 +30,13 @@ from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.fitted_rmax.correspondence import Correspondence, NoTransfer, OfLearner
-from sb3_combrel.fitted_rmax.frozen import cautious_function
 from sb3_combrel.fitted_rmax.optimism import RewardRange, worth_after_visits
 from sb3_combrel.fitted_rmax.promises import Promises
 from sb3_combrel.fitted_rmax.settings import MODELS, FittedRMaxSettings
 from sb3_combrel.fitted_rmax.workload import warn_if_long, workload
 from sb3_combrel.models.base import NO_PAIRS, Model, Transition
 from sb3_combrel.models.ends_by_action import evidence_for_action
-from sb3_combrel.planning.grid import fitting_grid
+from sb3_combrel.planning.grid import MAX_PAIRS_BY_DEFAULT, fitting_grid
 from sb3_combrel.planning.lines import moved_lines
 from sb3_combrel.planning.mdp import FiniteMDP
 from sb3_combrel.planning.planner import Planner
@@ -361,7 +360,21 @@ class FittedRMaxAgent:
             return None
         if self._cautious is None and self.mdp.arrays.modelled.any():
             finer = self._lines_move and self.transfer is None and self.task.is_bounded
-            self._cautious = cautious_function(self.model, self.planner, finer, holds=not self.is_coarse)
+    def _plan_cautiously(self, finer: bool) -> ValueFunction:
+        """Plan without optimism, from below, until the values have converged.
+
+        :param finer: whether to fit and plan on a grid twice as fine, which takes seconds, if the model does so and there is
+            room. Learning has no time for that at every step.
+        """
+        mdp, planner = self.mdp, self.planner
+        if finer and self.model.plans_finer and (grid := self.grid.finer()).n_points * mdp.n_actions <= MAX_PAIRS_BY_DEFAULT:
+            mdp, (low, high) = FiniteMDP(grid, mdp.n_actions, mdp.gamma), planner.bounds
+            self.model.on(mdp)
+            planner = Planner(mdp, max_value=high, min_value=low, tolerance=planner.tolerance)
+        values = planner.cautious_values(LONGEST_PLAN)
+        return ValueFunction(values, mdp.grid.plain, mdp.gamma, planner.bounds, planner.worth, holds=not self.is_coarse)
+
+            self._cautious = self._plan_cautiously(finer)
         return self._cautious
 
     def sample_action(self, state: np.ndarray) -> int:
