@@ -100,8 +100,7 @@ class FittedRMaxAgent:
         self._cautious: ValueFunction | None = None
         #: How often an action without a model was chosen in learning.
         self.n_optimistic_actions = 0
-        #: Whether to measure the time of planning, which takes some itself.
-        self.timed = False
+        #: How long planning has taken so far.
         self.planning_seconds = 0.0
         #: One thread at a time: predicting in one while another learns must be safe.
         self.lock = threading.RLock()
@@ -269,7 +268,7 @@ class FittedRMaxAgent:
 
     def _plan(self, max_sweeps: int) -> None:
         """Update the rows of the pairs that changed, and sweep over the grid."""
-        began = perf_counter() if self.timed else None
+        began = perf_counter()
         self._follow_rewards()
         if self._method.informs_model:
             self._outdated.append(self._changed_by_transfer())
@@ -279,8 +278,7 @@ class FittedRMaxAgent:
         self._search()
         self.n_sweeps += self.planner.sweep(max_sweeps)
         self._cautious = None
-        if began is not None:
-            self.planning_seconds += perf_counter() - began
+        self.planning_seconds += perf_counter() - began
 
     def _follow_rewards(self) -> None:
         """Plan with other optimism, or another discount, if what rewards have shown asks for it."""

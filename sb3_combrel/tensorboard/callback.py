@@ -141,7 +141,6 @@ class DashboardCallback(BaseCallback):
         self._of_logs, self._between_logs = _Allowance(half), _Allowance(half)
         self._of_pictures = _Allowance(self.picture_share, FIRST_PICTURES_SECONDS)
         self._log_began: float | None = None
-        self.agent.timed = True
         self._marked = time.perf_counter(), self.agent.planning_seconds
         self._write_settings(self._writer)
 
@@ -203,7 +202,7 @@ class DashboardCallback(BaseCallback):
     def _on_training_end(self) -> None:
         if self._writer is None:
             return
-        self.agent.timed, self.model.logs_statistics = False, True
+        self.model.logs_statistics = True
         if self._scalar_freq is not None and self.model.num_timesteps > self._scalars_at:
             self._write_scalars(self._writer)
         self._show(self._writer, at_end=True)

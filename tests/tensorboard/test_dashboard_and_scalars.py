@@ -77,10 +77,11 @@ def test_without_a_log_nothing_is_computed_for_one(transfers, monkeypatch):
     monkeypatch.setattr("sb3_combrel.tensorboard.callback.DashboardCallback._on_training_start", refuse)
     monkeypatch.setattr("sb3_combrel.transfer.methods.combrel.COMBREL.choices", refuse)
     model = walker(transfer=transfers["COMBREL"]).learn(200)
-    assert model._episode_num > 4 and model.agent.planning_seconds == 0.0
+    assert model._episode_num > 4
     monkeypatch.undo()
-    dashboard = DashboardCallback(picture_freq=10)
-    assert walker(transfer=transfers["COMBREL"]).learn(50, dashboard).agent.planning_seconds == 0.0
+    monkeypatch.setattr("sb3_combrel.fitted_rmax.agent.FittedRMaxAgent.statistics", refuse)
+    monkeypatch.setattr("sb3_combrel.tensorboard.callback.DashboardCallback._write_settings", refuse)
+    walker(transfer=transfers["COMBREL"]).learn(50, DashboardCallback(picture_freq=10))
 
 
 @pytest.mark.long
@@ -128,7 +129,6 @@ def test_learning_goes_on_in_the_same_log_after_an_interrupt(transfers, tmp_path
     model = walker(tmp_path, transfers["COMBREL"])
     with pytest.raises(KeyboardInterrupt):
         model.learn(1000, [Interrupt(), DashboardCallback(picture_freq=100)])
-    assert not model.agent.timed
     model.save(tmp_path / "model")
     model.learn(100, DashboardCallback(picture_freq=100), reset_num_timesteps=False)
     assert image_steps(tmp_path) == [100, 130, 200, 230]
@@ -303,9 +303,8 @@ def test_by_default_there_are_several_sets_of_pictures_in_a_run(tmp_path):
 
 
 def test_planning_takes_a_share_of_the_time(tmp_path):
-    model = walker(tmp_path).learn(200)
+    walker(tmp_path).learn(200)
     assert all(0.0 < share < 1.0 for share in scalars(events(run_folder(tmp_path)), "planner/time_share").values())
-    assert not model.agent.timed
 
 
 def test_samples_are_spread_and_complete_where_there_is_room():
