@@ -201,11 +201,12 @@ class FittedRMaxAgent:
         :param function: the values of states; None: the learner's own
         """
         prediction, given = self.model.predict_at(state)
-        return prediction, given, self._q.compute(prediction, state, function or self._function(self.planner.values))
+        return prediction, given, self._q.compute(prediction, state, function or self._function())
 
-    def _function(self, values: np.ndarray) -> ValueFunction:
-        """The values of states between the grid points; shape (n_points,) at these."""
-        return ValueFunction(values, self.grid.plain, self.mdp.gamma, self.planner.bounds, self.planner.worth)
+    def _function(self) -> ValueFunction:
+        """The learner's own values of states."""
+        planner = self.planner
+        return ValueFunction(planner.values, self.grid.plain, self.mdp.gamma, planner.bounds, planner.worth)
 
     def update(
         self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool, environment: int = 0
@@ -379,18 +380,16 @@ class FittedRMaxAgent:
             self._evaluate(state)
             return int(self.prediction_rng.choice(np.flatnonzero(self._q.q == self._q.q.max())))
 
-    def q_values(self, state: np.ndarray, values: np.ndarray | None = None) -> np.ndarray:
+    def q_values(self, state: np.ndarray) -> np.ndarray:
         """Compute the action values at an exact state.
 
         Optimistic actions have ``max_value``, or what a prior bounds it by; less where one has been and found nothing.
 
         :param state: unit coordinates, shape (n_variables,)
-        :param values: at the grid points; by default the planner's, optimistic ones
         :return: shape (n_actions,)
         """
         with self.lock:
-            function = None if values is None else self._function(values)
-            self._evaluate(np.ascontiguousarray(state, dtype=np.float64), function)
+            self._evaluate(np.ascontiguousarray(state, dtype=np.float64))
             return self._q.q.copy()
 
     def take_in(self, transitions: Sequence[Transition]) -> None:

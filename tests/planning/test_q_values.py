@@ -26,9 +26,7 @@ def agent_and_definition(n_variables, resolution, *, gamma=1.0, max_value=0.0, t
 
 
 def q_values(agent, state, values, holds):
-    if not holds:
-        return agent.q_values(state, values)
-    agent._evaluate(state, agent._function(values)._replace(holds=True))
+    agent._evaluate(state, agent._function()._replace(values=values, holds=holds))
     return agent._q.q.copy()
 
 
@@ -83,7 +81,7 @@ class OneVariable:
             self.agent.model.add(state, action, reward, state + effect, terminated)
 
     def q_values(self, state):
-        return self.agent.q_values(np.array([state]), self.values)
+        return q_values(self.agent, np.array([state]), self.values, holds=False)
 
     def q(self, state):
         return self.q_values(state)[0]
@@ -141,11 +139,11 @@ def test_values_that_no_action_keeps_do_not_hold_a_frozen_policy():
 
 def test_asking_for_q_changes_nothing_and_gives_an_array_of_the_caller_s_own(line):
     line.learn(0.5, 0.05)
-    before, first = copy.deepcopy(line.agent), line.q_values(0.52)
+    before, first = copy.deepcopy(line.agent), line.agent.q_values(np.array([0.52]))
     expected = first.copy()
-    line.q_values(0.1)[:] = np.nan
+    line.agent.q_values(np.array([0.1]))[:] = np.nan
     np.testing.assert_array_equal(first, expected)
-    np.testing.assert_array_equal(line.q_values(0.52), expected)
+    np.testing.assert_array_equal(line.agent.q_values(np.array([0.52])), expected)
     assert_same_state(line.agent, before)
 
 
