@@ -242,7 +242,7 @@ class FittedRMaxAgent:
         """
         with self.lock:
             self.rewards.n_truncated += bool(truncated)
-            self.promises.end_episode(environment)
+            self.promises.stays.pop(environment, None)
             self._method.environment = environment
             self._method.end_episode(truncated)
             self._outdated.append(self.model.end_episode())
@@ -357,6 +357,9 @@ class FittedRMaxAgent:
             return None
         if self._cautious is None and self.mdp.arrays.modelled.any():
             finer = self._lines_move and self.transfer is None and self.task.is_bounded
+            self._cautious = self._plan_cautiously(finer)
+        return self._cautious
+
     def _plan_cautiously(self, finer: bool) -> ValueFunction:
         """Plan without optimism, from below, until the values have converged.
 
@@ -370,9 +373,6 @@ class FittedRMaxAgent:
             planner = Planner(mdp, max_value=high, min_value=low, tolerance=planner.tolerance)
         values = planner.cautious_values(LONGEST_PLAN)
         return ValueFunction(values, mdp.grid.plain, mdp.gamma, planner.bounds, planner.worth, holds=not self.is_coarse)
-
-            self._cautious = self._plan_cautiously(finer)
-        return self._cautious
 
     def sample_action(self, state: np.ndarray) -> int:
         """Choose an action as in learning, optimistic ones first, but for a prediction: it does not change what is learned."""

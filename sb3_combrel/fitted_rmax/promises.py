@@ -38,7 +38,6 @@ class Promises:
 
     def __init__(self, grid: StateGrid, n_actions: int):
         self._grid, self._n_actions = grid, n_actions
-        self._axes = list(zip(grid.arrays.periodic.tolist(), grid.arrays.cells.tolist(), strict=True))
         #: By environment.
         self.stays: dict[int, Stay] = {}
 
@@ -68,20 +67,15 @@ class Promises:
             stay.discount *= gamma
             stay.n_steps += 1
 
-    def end_episode(self, environment: int) -> None:
-        """Forget a stay."""
-        self.stays.pop(environment, None)
-
     def _has_left(self, state: np.ndarray, before: np.ndarray) -> bool:
-        grid = self._grid.arrays
+        grid, ones = self._grid.arrays, np.ones(self._grid.n_variables)
         if grid.even:
-            return any(
-                (min(abs(here - there), 1.0 - abs(here - there)) if periodic else abs(here - there)) * cells >= 1.0
-                for here, there, (periodic, cells) in zip(state.tolist(), before.tolist(), self._axes, strict=True)
-            )
-        here, there = self._grid.coordinates(np.stack([state, before]))
+            here, there, period, cells = state, before, ones, grid.cells
+        else:
+            (here, there), period, cells = self._grid.coordinates(np.stack([state, before])), grid.shape, ones
         apart = np.abs(here - there)
-        return bool((np.where(grid.periodic, np.minimum(apart, grid.shape - apart), apart) >= 1.0).any())
+        apart = np.where(grid.periodic, np.minimum(apart, period - apart), apart)
+        return bool((apart * cells >= 1.0).any())
 
     def rows(self) -> np.ndarray:
         """The stays, float64, shape (n_environments, n_variables + 7), for :meth:`restore`."""

@@ -94,7 +94,7 @@ def test_each_environment_has_its_own_stay_and_an_episode_ends_it():
     held = promises.choose(0, HERE, -30.0, BEST, rng)
     rng.bit_generator.state = state
     assert again.choose(0, HERE, -30.0, BEST, rng) == held and promises.stays[0].held == held
-    promises.end_episode(0)
+    del promises.stays[0]
     assert promises.choose(0, HERE, -30.0, BEST, rng) == BEST
 
 
