@@ -6,6 +6,8 @@ import numpy as np
 
 from sb3_combrel.common.constants import DISCOUNT, WORTH_TRYING
 
+LARGEST = float(np.finfo(np.float64).max)
+
 
 class RewardRange:
     """The rewards seen so far, and the ``gamma`` and ``max_value`` that follow from them.
@@ -20,7 +22,8 @@ class RewardRange:
 
     def __init__(self, gamma: float | None, max_value: float | None):
         self._gamma, self._max_value = gamma, max_value
-        self.largest, self.largest_end, self.lowest = -np.inf, -np.inf, np.inf
+        # Finite, as what is saved must be.
+        self.largest, self.largest_end, self.lowest = -LARGEST, -LARGEST, LARGEST
         self.n_ended = self.n_truncated = 0
 
     def note(self, reward: float, terminated: bool) -> None:
@@ -69,15 +72,12 @@ class RewardRange:
 
     def get_state(self) -> np.ndarray:
         """What has been seen, float64, shape (5,), for :meth:`set_state`."""
-        seen = np.array([self.largest, self.largest_end, self.lowest, self.n_ended, self.n_truncated], dtype=np.float64)
-        return np.nan_to_num(seen, posinf=np.finfo(np.float64).max, neginf=np.finfo(np.float64).min)
+        return np.array([self.largest, self.largest_end, self.lowest, self.n_ended, self.n_truncated], dtype=np.float64)
 
     def set_state(self, state: np.ndarray) -> None:
         """Take over what :meth:`get_state` returned."""
-        limit = np.finfo(np.float64).max
-        seen = [np.copysign(np.inf, value) if abs(value) == limit else value for value in state.tolist()]
-        self.largest, self.largest_end, self.lowest = map(float, seen[:3])
-        self.n_ended, self.n_truncated = int(seen[3]), int(seen[4])
+        self.largest, self.largest_end, self.lowest = state[:3].tolist()
+        self.n_ended, self.n_truncated = map(int, state[3:])
 
 
 def worth_after_visits(worth: np.ndarray, visits: np.ndarray, reward: float, gamma: float) -> np.ndarray:
