@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch as th
@@ -38,8 +38,6 @@ from sb3_combrel.fitted_rmax.vec_envs import (
 )
 from sb3_combrel.transfer.base import Transfer
 from sb3_combrel.transfer.by_name import make_transfer, restore_transfer
-
-SelfFittedRMax = TypeVar("SelfFittedRMax", bound="FittedRMax")
 
 DEFAULT_TIMESTEPS = 20_000
 # Thousands of years: larger numbers, such as 1e308, are mistakes.
@@ -279,14 +277,14 @@ class FittedRMax(PastData):
         return self.policy.agent
 
     def learn(
-        self: SelfFittedRMax,
+        self,
         total_timesteps: int = DEFAULT_TIMESTEPS,
         callback: MaybeCallback = None,
         log_interval: int | None = 4,
         tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
-    ) -> SelfFittedRMax:
+    ) -> Self:
         """Learn, and return the trained model.
 
         :param total_timesteps: environment steps, of all environments together; with 0 it returns at once

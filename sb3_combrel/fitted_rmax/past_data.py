@@ -7,7 +7,7 @@ import reprlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self
 
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
@@ -19,8 +19,6 @@ from sb3_combrel.sources.experience import KINDS, read_experience, read_named
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.sources.transitions import describe_origin
 
-SelfPastData = TypeVar("SelfPastData", bound="PastData")
-
 # Warnings: an angle that spans more periods, and a value that lies beyond nearly all others by more ranges of theirs.
 MANY_PERIODS, MANY_RANGES = 10, 20
 
@@ -31,7 +29,7 @@ class PastData(SavedAlgorithm):
     env: VecEnv | None
     _last_states: np.ndarray | None
 
-    def load_instances(self: SelfPastData, instances: Any, n_instances: int = 1000) -> SelfPastData:
+    def load_instances(self, instances: Any, n_instances: int = 1000) -> Self:
         """Take in past transitions of the same task, as if the agent had made them: known at once, and planned with.
 
         They do not count as time steps. Scales that are found from observations, ``gamma`` and ``max_value`` follow them.

@@ -9,7 +9,7 @@ import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, Self, cast
 
 import numpy as np
 import torch as th
@@ -34,8 +34,6 @@ NOT_TO_CHANGE = {"degree", "max_instances", "model_breadth", "periodic", "resolu
 OF_VALUES = {"gamma", "max_value"}
 # The version of a file that names none, as those of other algorithms do not.
 BEFORE = "before 0.2"
-
-SelfSavedAlgorithm = TypeVar("SelfSavedAlgorithm", bound="SavedAlgorithm")
 
 
 class ParametersError(ValueError, RuntimeError):
@@ -89,7 +87,7 @@ class SavedAlgorithm(BaseAlgorithm):
 
     @classmethod
     def load(  # type: ignore[override]
-        cls: type[SelfSavedAlgorithm],
+        cls,
         path: str | Path | io.BufferedIOBase,
         env: GymEnv | str | None = None,
         device: th.device | str = "auto",
@@ -97,7 +95,7 @@ class SavedAlgorithm(BaseAlgorithm):
         print_system_info: bool = False,
         force_reset: bool = True,
         **kwargs: Any,
-    ) -> SelfSavedAlgorithm:
+    ) -> Self:
         """Load the model from a zip-file.
 
         :param path: path to the file (or a file-like) where to load the agent from
