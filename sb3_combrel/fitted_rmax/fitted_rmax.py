@@ -17,7 +17,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import safe_mean
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_combrel.common.checks import as_count, check_boolean, check_count
 from sb3_combrel.common.observations import with_own_arrays
@@ -435,8 +435,6 @@ class FittedRMax(PastData):
         refuse_normalized_observations(given)
         joined_names(self._names, names_of(given))
         super().set_env(env, force_reset)
-        assert self.env is not None
-        self._vec_normalize_env = unwrap_vec_normalize(self.env)
 
 
 def _are_alike(one: Any, other: Any) -> bool:
