@@ -178,18 +178,13 @@ def _warn_of_values(name: str, values: np.ndarray, width: float, periodic: bool)
     if periodic and np.ptp(values) > MANY_PERIODS * width:
         wrong = f"{name} from {values.min():.4g} to {values.max():.4g}, many periods of {width:.4g}"
         warn_user(f"the instances have {wrong}: convert it if its units are others than the task's, degrees")
-    if not width < LARGEST_BOUND and (far := _far_beyond(values)) is not None:
-        warn_user(
-            f"the instances have {name}={far:.4g}, far from nearly all others, and variables without bounds are scaled by the "
-            "range of what is observed: leave such rows out if they are errors of a sensor"
-        )
-
-
-def _far_beyond(values: np.ndarray) -> float | None:
-    """The value that lies farthest beyond nearly all others, if by many times their range."""
     low, high = np.percentile(values, [1.0, 99.0])
     beyond = np.maximum(low - values, values - high)
-    return float(values[beyond.argmax()]) if beyond.max() > MANY_RANGES * (high - low) > 0.0 else None
+    if not width < LARGEST_BOUND and beyond.max() > MANY_RANGES * (high - low) > 0.0:
+        warn_user(
+            f"the instances have {name}={values[beyond.argmax()]:.4g}, far from nearly all others, and variables without "
+            "bounds are scaled by the range of what is observed: leave such rows out if they are errors of a sensor"
+        )
 
 
 def _are_numbered(names: Sequence[str]) -> bool:
