@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task
-from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
+from sb3_combrel.fitted_rmax.agent import OF_TRANSFER, FittedRMaxAgent
 from sb3_combrel.fitted_rmax.scales import FoundScales
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 from sb3_combrel.models.base import Model
@@ -129,67 +129,51 @@ class FittedRMaxPolicy(BasePolicy):
         with self.agent.lock:
             return {**self.agent.get_state(), "scales": self.scales.get_state()}
 
-    def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
-        super()._save_to_state_dict(destination, prefix, keep_vars)
-        for name, array in self._learned().items():
-            # Column by column: a file of it becomes a tenth smaller.
-            destination[prefix + name] = th.as_tensor(np.array(array, dtype=np.float64, order="F"), device=self.device)
+    def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, th.Tensor]:  # type: ignore[override]
+        """What has been learned, float64 tensors by name."""
+        # Column by column: a file of it becomes a tenth smaller.
+        arrays = {name: np.array(array, dtype=np.float64, order="F") for name, array in self._learned().items()}
+        return {name: th.as_tensor(array, device=self.device) for name, array in arrays.items()}
 
-    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
+    def load_state_dict(  # type: ignore[override]
+        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
+    ) -> None:
         """Load parameters as PyTorch does; without ``strict`` those that are not given stay as they are.
 
         :raises RuntimeError: if parameters do not fit; nothing has changed then
         """
-        if not strict:
-            present = self.state_dict()
-            state_dict = {**present, **{name: tensor for name, tensor in state_dict.items() if name in present}}
-        return super().load_state_dict(state_dict, strict, assign)
-
-    def _load_from_state_dict(
-        self,
-        state_dict: dict[str, Any],
-        prefix: str,
-        local_metadata: dict[str, Any],
-        strict: bool,
-        missing_keys: list[str],
-        unexpected_keys: list[str],
-        error_msgs: list[str],
-    ) -> None:
-        expected = self._learned()
+        expected = self.state_dict()
         # Older files do not have it: there where one arrives decides how episodes end.
-        state_dict.setdefault(prefix + "ends", th.tensor([0.0, 1.0]))
-        missing_keys.extend(prefix + name for name in expected if prefix + name not in state_dict)
-        unexpected_keys.extend(k for k in state_dict if strict and k.startswith(prefix) and k[len(prefix) :] not in expected)
-        if self.transfer is None and any(name.startswith(prefix + "transfer_") for name in state_dict):
-            error_msgs.append("these are parameters of a model with a transfer method: pass the same one, transfer=...")
-        if missing_keys or unexpected_keys or error_msgs:
-            return
-        saved = {name: state_dict[prefix + name] for name in expected}
-        problems = [problem for name, tensor in saved.items() if (problem := _misfit(name, tensor, expected[name]))]
-        error_msgs.extend(problems)
-        if not problems:
-            arrays = {name: tensor.detach().cpu().numpy().astype(np.float64) for name, tensor in saved.items()}
-            fixed = self.scales.scaling if self.scales.fixed else None
-            self._replace_learned(arrays)
-            if fixed is not None and fixed != self.scales.scaling:
-                # The user gives other bounds than those of the file.
-                self.scales.scaling = fixed
-                self.agent.rescale(fixed, fixed)
+        given = {**({"ends": th.tensor([0.0, 1.0])} if strict else expected), **state_dict}
+        problems = [problem for name, tensor in expected.items() if (problem := _misfit(name, given.get(name), tensor))]
+        if strict:
+            problems += [f"{name} is unknown" for name in given if name not in expected]
+            if self.transfer is None and any(name.startswith(OF_TRANSFER) for name in given):
+                problems.append("these are parameters of a model with a transfer method: pass the same one, transfer=...")
+        if problems:
+            raise RuntimeError(f"parameters do not fit: {'; '.join(problems)}")
+        fixed = self.scales.scaling if self.scales.fixed else None
+        self._replace_learned({name: given[name].detach().cpu().numpy().astype(np.float64) for name in expected})
+        if fixed is not None and fixed != self.scales.scaling:
+            # The user gives other bounds than those of the file.
+            self.scales.scaling = fixed
+            self.agent.rescale(fixed, fixed)
 
     def _replace_learned(self, arrays: dict[str, np.ndarray]) -> None:
         """Take over what :meth:`_learned` returned, in place of what was learned."""
-        of_agent = {name: array for name, array in arrays.items() if name != "scales"}
+    if tensor is None:
+        return f"{name} is missing"
         with self.agent.lock:
             self.scales.set_state(arrays["scales"])
-            self.agent.set_state(of_agent, self.scales.scaling, self.scales.bounds)
+            self.agent.set_state(arrays, self.scales.scaling, self.scales.bounds)
 
 
-def _misfit(name: str, tensor: Any, expected: np.ndarray) -> str:
+def _misfit(name: str, tensor: Any, expected: th.Tensor) -> str:
     """Say in what a saved tensor differs from what a new agent has by that name; arrays may differ in their rows."""
     if not isinstance(tensor, th.Tensor) or tensor.dtype not in (th.float64, th.float32):
         return f"{name} must be a tensor of floating-point numbers, got {getattr(tensor, 'dtype', type(tensor).__name__)}"
     fixed = 1 if expected.ndim > 1 else 0
-    if tensor.ndim != expected.ndim or tuple(tensor.shape[fixed:]) != expected.shape[fixed:]:
+    if tensor.ndim != expected.ndim or tensor.shape[fixed:] != expected.shape[fixed:]:
         shape = ", ".join(["any"] * fixed + [str(n) for n in expected.shape[fixed:]])
         return f"{name} must have shape ({shape}), got {tuple(tensor.shape)}"
     return "" if th.isfinite(tensor).all() else f"{name} must have finite numbers only"
