@@ -11,11 +11,10 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
-from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task
 from sb3_combrel.fitted_rmax.agent import OF_TRANSFER, FittedRMaxAgent
 from sb3_combrel.fitted_rmax.scales import FoundScales
-from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
+from sb3_combrel.fitted_rmax.settings import MODELS, FittedRMaxSettings
 from sb3_combrel.models.base import Model
 from sb3_combrel.transfer.base import Transfer
 from sb3_combrel.transfer.by_name import describe_transfer, restore_transfer
@@ -60,13 +59,6 @@ class FittedRMaxPolicy(BasePolicy):
         #: Observations, raw units, to unit coordinates.
         self.to_unit = self.scales.to_unit
         self._first_action = int(action_space.start)
-        self._settings = settings
-        self._model_class = model_class
-
-    @property
-    def scaling(self) -> StateScaling:
-        """Raw <-> unit coordinates."""
-        return self.scales.scaling
 
     def take_in(
         self, states: np.ndarray, actions: np.ndarray, rewards: np.ndarray, next_states: np.ndarray, terminated: np.ndarray
@@ -92,7 +84,7 @@ class FittedRMaxPolicy(BasePolicy):
             return False
         # No other thread may see new scales with old instances.
         with self.agent.lock:
-            before, scaling = self.scaling, self.scales.renewed(episode_ended, self.agent.transfers)
+            before, scaling = self.scales.scaling, self.scales.renewed(episode_ended, self.agent.transfers)
             if scaling is not None:
                 try:
                     self.scales.warn_of_surprises(before, self.agent.task.state_names, self.agent.model.n_instances)
@@ -109,9 +101,10 @@ class FittedRMaxPolicy(BasePolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         spaces_of_both = dict(observation_space=self.observation_space, action_space=self.action_space)
-        parameters = {**spaces_of_both, **self._settings, "transfer": describe_transfer(self.transfer)}
+        settings, model_class = self.agent.settings, self.agent.model_class
+        parameters = {**spaces_of_both, **vars(settings), "transfer": describe_transfer(self.transfer)}
         # A class is pickled by its name, and imported by who reads it: only one of the user's own has to be.
-        return parameters if self._model_class is None else {**parameters, "model_class": self._model_class}
+        return parameters if model_class is MODELS[settings.degree] else {**parameters, "model_class": model_class}
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(obs, deterministic)
@@ -161,8 +154,6 @@ class FittedRMaxPolicy(BasePolicy):
 
     def _replace_learned(self, arrays: dict[str, np.ndarray]) -> None:
         """Take over what :meth:`_learned` returned, in place of what was learned."""
-    if tensor is None:
-        return f"{name} is missing"
         with self.agent.lock:
             self.scales.set_state(arrays["scales"])
             self.agent.set_state(arrays, self.scales.scaling, self.scales.bounds)
@@ -170,6 +161,8 @@ class FittedRMaxPolicy(BasePolicy):
 
 def _misfit(name: str, tensor: Any, expected: th.Tensor) -> str:
     """Say in what a saved tensor differs from what a new agent has by that name; arrays may differ in their rows."""
+    if tensor is None:
+        return f"{name} is missing"
     if not isinstance(tensor, th.Tensor) or tensor.dtype not in (th.float64, th.float32):
         return f"{name} must be a tensor of floating-point numbers, got {getattr(tensor, 'dtype', type(tensor).__name__)}"
     fixed = 1 if expected.ndim > 1 else 0

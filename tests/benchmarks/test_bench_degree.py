@@ -14,7 +14,7 @@ def learner(request):
     """An agent that has learned for some episodes, and where it is."""
     model = FittedRMax("combrel/MountainCar4D-v0", degree=request.param, resolution=3, seed=0).learn(N_STEPS_BEFORE)
     env = gymnasium.make("combrel/MountainCar4D-v0")
-    return model.agent, model.policy.scaling, env
+    return model.agent, model.policy.scales.scaling, env
 
 
 def test_one_learning_step(benchmark, learner):

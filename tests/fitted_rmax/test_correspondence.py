@@ -70,7 +70,7 @@ METHODS = {
 @pytest.mark.parametrize("make", METHODS.values(), ids=METHODS)
 def test_a_source_fits_a_target_whose_scales_are_finer_than_its_bounds(make, tmp_path):
     model = learnt(make())
-    scaling, seen = model.policy.scaling, model.transfer.task.scaling
+    scaling, seen = model.policy.scales.scaling, model.transfer.task.scaling
     assert scaling.high[0] - scaling.low[0] < 4.0
     np.testing.assert_array_equal((seen.low[0], seen.high[0]), (-20.0, 20.0))
     assert model.transfer.region_errors.task.scaling == seen
@@ -84,7 +84,7 @@ def test_what_a_source_predicts_is_the_same_in_raw_units():
     units = np.column_stack([np.linspace(0.3, 0.6, 5), np.ones(5) / 2])
     for action, effect in enumerate((-STRIDE, STRIDE)):
         given = model.agent.model.transfer.prior(units, np.full(5, action))
-        scaling = model.policy.scaling
+        scaling = model.policy.scales.scaling
         np.testing.assert_allclose(given.effect * (scaling.high - scaling.low), [[effect, 0.0]] * 5, atol=0.02)
 
 
@@ -117,10 +117,10 @@ def test_once_instances_are_transferred_variables_take_all_of_their_bounds(tmp_p
             return self.transferred(self.task.sample_states[points], actions, own_weight)
 
     model = FittedRMax(WideWalk(), transfer=Later(wide_source(), SAME, breadth=0.01), seed=0, resolution=3).learn(31)
-    assert model.policy.scaling.high[0] - model.policy.scaling.low[0] < 4.0 and not model.agent.transfers
+    assert model.policy.scales.scaling.high[0] - model.policy.scales.scaling.low[0] < 4.0 and not model.agent.transfers
     model.learn(60, reset_num_timesteps=False)
     for each in (model, model.learn(40, reset_num_timesteps=False)):
-        assert (each.policy.scaling.low[0], each.policy.scaling.high[0]) == (-20.0, 20.0)
+        assert (each.policy.scales.scaling.low[0], each.policy.scales.scaling.high[0]) == (-20.0, 20.0)
     kept = FoundScales(model.observation_space, None, np.zeros(2, dtype=bool))
     kept.set_state(model.policy.scales.get_state())
     assert kept.renewed(episode_ended=True) is None

@@ -138,7 +138,7 @@ def test_found_scales_discount_and_optimism_follow():
     assert (loaded.agent.mdp.gamma, loaded.agent.planner.bounds[1]) == pytest.approx((0.99, 200.0))
     assert loaded.policy.scales.observed[1, 0] == pytest.approx(source.next_states[:, 0].max())
     narrow = replace(source, states=0.1 * source.states, next_states=0.1 * source.next_states)
-    assert model().load_instances(narrow).policy.scaling.high[0] < 0.2
+    assert model().load_instances(narrow).policy.scales.scaling.high[0] < 0.2
 
 
 def test_a_transfer_method_observes_it_as_well():

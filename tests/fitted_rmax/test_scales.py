@@ -189,9 +189,9 @@ class Far(gym.Env):
 @pytest.mark.filterwarnings("error")
 def test_a_learner_follows_its_scales_and_keeps_its_transitions():
     model = FittedRMax(Far(), seed=0, resolution=3)
-    assert model.policy.scaling.high.tolist() == [1.0, 1.0]
+    assert model.policy.scales.scaling.high.tolist() == [1.0, 1.0]
     model.learn(200)
-    scaling, agent = model.policy.scaling, model.agent
+    scaling, agent = model.policy.scales.scaling, model.agent
     assert (scaling.high > 10.0).all() and agent.task.scaling == scaling
     transitions = agent.model.transitions()
     assert len(transitions) == 200
@@ -204,14 +204,14 @@ def test_a_learner_follows_its_scales_and_keeps_its_transitions():
 
 def test_given_bounds_of_a_learner_stay():
     model = FittedRMax(Walk(), bounds=([-5.0, 0.0], [5.0, 2.0]), seed=0, resolution=3).learn(100)
-    assert (model.policy.scaling.low.tolist(), model.policy.scaling.high.tolist()) == ([-5.0, 0.0], [5.0, 2.0])
+    assert (model.policy.scales.scaling.low.tolist(), model.policy.scales.scaling.high.tolist()) == ([-5.0, 0.0], [5.0, 2.0])
     model = FittedRMax(Walk(), seed=0, resolution=3).learn(100)
-    assert model.policy.scaling.high.tolist() == [1.0, 2.0], "it uses most of its range"
+    assert model.policy.scales.scaling.high.tolist() == [1.0, 2.0], "it uses most of its range"
 
 
 @pytest.mark.filterwarnings("error")
 def test_cart_pole_is_learned_from_without_any_argument():
     model = FittedRMax("CartPole-v1", seed=0).learn(150)
     assert model.agent.model.n_instances == 150 and np.isfinite(model.agent.planner.values).all()
-    assert (model.policy.scaling.high - model.policy.scaling.low < 10.0).all()
+    assert (model.policy.scales.scaling.high - model.policy.scales.scaling.low < 10.0).all()
     assert (model.agent.mdp.gamma, model.agent.planner.bounds[1]) == (0.99, pytest.approx(100.0))

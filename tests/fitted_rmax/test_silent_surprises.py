@@ -55,7 +55,7 @@ def test_a_variable_between_bounds_without_a_width_is_one_that_never_changes():
             self.observation_space = gym.spaces.Box(np.float32([-1.0, 1.0]), np.float32([1.0, 1.0]))
 
     model = small(Constant()).learn(100)
-    assert model.policy.scaling.low[1] < 1.0 <= model.policy.scaling.high[1]
+    assert model.policy.scales.scaling.low[1] < 1.0 <= model.policy.scales.scaling.high[1]
     source = SourceInstances.record(None, Constant(), 20, seed=0)
     assert source.low[1] < 1.0 < source.high[1]
 

@@ -80,7 +80,7 @@ def stored(model):
     for action in range(2):
         n = instances.size[action]
         state, end = instances.state[action, :n], instances.state[action, :n] + instances.effect[action, :n]
-        raw = model.policy.scaling.to_raw(state), model.policy.scaling.to_raw(end)
+        raw = model.policy.scales.scaling.to_raw(state), model.policy.scales.scaling.to_raw(end)
         rows.append(np.column_stack([*raw, instances.reward[action, :n], instances.terminated[action, :n]]))
     return np.vstack(rows)
 

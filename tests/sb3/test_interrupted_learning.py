@@ -29,7 +29,7 @@ def test_two_parts_equal_one_where_scales_and_optimism_are_found(arguments):
     whole, parts = (FittedRMax("CartPole-v1", seed=0, resolution=3, **arguments) for _ in range(2))
     whole.learn(160)
     parts.learn(70).learn(90, reset_num_timesteps=False)
-    assert (whole.policy.scaling.high < 10.0).all() and learned_the_same(parts, whole)
+    assert (whole.policy.scales.scaling.high < 10.0).all() and learned_the_same(parts, whole)
 
 
 class Copies(BaseCallback):

@@ -28,7 +28,7 @@ def test_values_follow_another_gamma_or_bound(file, change):
 def test_scales_follow_other_bounds(file):
     bounds = [-1.0, 0.0], [2.0, 2.0]
     loaded, plain = FittedRMax.load(file, env=Walk(), bounds=bounds), FittedRMax.load(file)
-    np.testing.assert_array_equal((loaded.policy.scaling.low, loaded.policy.scaling.high), bounds)
+    np.testing.assert_array_equal((loaded.policy.scales.scaling.low, loaded.policy.scales.scaling.high), bounds)
     one, other = loaded.source_instances(), plain.source_instances()
     np.testing.assert_allclose(one.states, other.states, atol=1e-9)
     actions = [each.predict(np.float32([0.5, 1.0]), deterministic=True)[0] for each in (loaded, plain)]
@@ -38,7 +38,7 @@ def test_scales_follow_other_bounds(file):
 def test_what_was_learned_of_a_source_is_learned_anew_by_other_bounds(tmp_path):
     small(transfer=COMBREL(walk_source()), bounds=([-1.0, 0.0], [1.0, 2.0])).learn(100).save(tmp_path / "walk")
     loaded = FittedRMax.load(tmp_path / "walk", bounds=([-1.5, 0.0], [1.5, 2.0]))
-    assert loaded.transfer.task.scaling == loaded.policy.scaling and loaded.transfer.mapping_counts() is not None
+    assert loaded.transfer.task.scaling == loaded.policy.scales.scaling and loaded.transfer.mapping_counts() is not None
 
 
 def test_more_instances_are_taken_in(file):

@@ -61,7 +61,7 @@ def test_pictures_and_choices_follow_the_scales_of_the_agent(use, tmp_path):
     dashboard = DashboardCallback(picture_freq=7, picture_share=1.0, scalar_share=1.0)
     transfer = COMBREL(SourceInstances.record(None, NamedWalk(), n_instances=150, seed=0), use=use)
     model = walker(tmp_path, transfer, WideWalk()).learn(150, dashboard, log_interval=1)
-    scaling = model.policy.scaling
+    scaling = model.policy.scales.scaling
     assert scaling.high[0] < 2.0
     left, right, *_ = dashboard._planes[0].extent
     assert scaling.low[0] - 0.2 < left < scaling.low[0] and scaling.high[0] < right < scaling.high[0] + 0.2

@@ -150,7 +150,7 @@ def same_as_in_learning(model):
     space = model.observation_space
     states = np.random.default_rng(0).uniform(space.low, space.high, (300, len(space.low))).astype(np.float32)
     frozen, _ = model.predict(states, deterministic=True)
-    scaling = model.policy.scaling
+    scaling = model.policy.scales.scaling
     learning = [int(model.agent.q_values(scaling.to_unit(state.astype(np.float64))).argmax()) for state in states]
     return float((frozen == learning).mean())
 
