@@ -15,8 +15,7 @@ from sb3_combrel.common.user_warnings import warn_user
 
 def names_of(env: VecEnv) -> dict[str, Any]:
     """Return names of state variables and actions, where the environment has as many of them as it must have."""
-    lengths = {"state_names": (env.observation_space.shape or (0,))[0], "action_names": getattr(env.action_space, "n", 0)}
-    found = {name: _list_of(env, name, int(n), (str,)) for name, n in lengths.items()}
+    found = {name: _list_of(env, name, str) for name in ("state_names", "action_names")}
     return {name: names for name, names in found.items() if names}
 
 
@@ -30,8 +29,7 @@ def joined_names(saved: dict[str, Any], of_env: dict[str, Any]) -> dict[str, Any
 
 def periodic_of(env: VecEnv) -> list[bool] | None:
     """Return which state variables are periodic, where the environment says so in its attribute ``periodic``."""
-    n_variables = (env.observation_space.shape or (0,))[0]
-    flags = _list_of(env, "periodic", n_variables, (bool, np.bool_))
+    flags = _list_of(env, "periodic", bool, np.bool_)
     return None if flags is None else [bool(flag) for flag in flags]
 
 
@@ -52,8 +50,10 @@ def warn_of_shared(env: VecEnv, callback: BaseCallback) -> None:
         )
 
 
-def _list_of(env: VecEnv, name: str, n: int, types: tuple[type, ...]) -> list[Any] | None:
-    """Return an attribute of the first environment, if it is ``n`` values of some types; a warning if it is something else."""
+def _list_of(env: VecEnv, name: str, *types: type) -> list[Any] | None:
+    """An attribute of the first environment, if it is a value for each variable, or action; a warning if it is not."""
+    what = "action" if name == "action_names" else "variable"
+    n = int(getattr(env.action_space, "n", 0) if what == "action" else (env.observation_space.shape or (0,))[0])
     # Asking a SubprocVecEnv for an attribute that is not there would end its worker.
     if n == 0 or not env.has_attr(name):
         return None
@@ -62,7 +62,6 @@ def _list_of(env: VecEnv, name: str, n: int, types: tuple[type, ...]) -> list[An
     if is_list and len(value) == n and all(isinstance(each, types) for each in value):
         return list(value)
     if not (types == (str,) and (value is None or (is_list and len(value) == 0))):
-        what = "action" if name == "action_names" else "variable"
         warn_user(
             f"the environment's {name}={value!r} is not one {types[0].__name__} for each of the {n} {what}s, and is ignored: "
             f"{'pass FittedRMax(env, periodic=[...])' if name == 'periodic' else 'an environment may leave it out'}"
