@@ -8,7 +8,7 @@ from helpers.agents import assert_same_state, make_agent
 from helpers.own_method import Mine
 from scipy.interpolate import RegularGridInterpolator
 
-from sb3_combrel.fitted_rmax import frozen
+from sb3_combrel.fitted_rmax import agent as agent_module
 from sb3_combrel.planning.mdp import FiniteMDP
 
 N_CELLS, STEP = 4, 0.09
@@ -76,10 +76,10 @@ def test_it_acts_by_value_iteration_over_what_is_known_on_a_grid_twice_as_fine(a
 
 
 def test_the_learner_s_grid_does_where_a_finer_one_has_too_many_pairs(monkeypatch):
-    monkeypatch.setattr(frozen, "MAX_PAIRS_BY_DEFAULT", 9**3 * 6 - 1)
+    monkeypatch.setattr(agent_module, "MAX_PAIRS_BY_DEFAULT", 9**3 * 6 - 1)
     agent = point_agent()
     assert agent._function_of_frozen().grid is agent.grid.plain
-    monkeypatch.setattr(frozen, "MAX_PAIRS_BY_DEFAULT", 9**3 * 6)
+    monkeypatch.setattr(agent_module, "MAX_PAIRS_BY_DEFAULT", 9**3 * 6)
     agent.plan_anew()
     assert len(agent._function_of_frozen().values) == 9**3
 
