@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-import tempfile
+import secrets
 from pathlib import Path
 
 
@@ -15,17 +15,12 @@ def write_whole(target: Path, content: bytes) -> None:
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     # In the same folder, as a file can only be renamed within one file system.
-    temporary = tempfile.NamedTemporaryFile(prefix=target.name, suffix=".part", dir=target.parent, delete=False)
+    temporary = target.parent / f"{target.name}.{secrets.token_hex(4)}.part"
     try:
-        with temporary as file:
-            file.write(content)
-        # Temporary files are private; give this one the rights of any new file.
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary.name, 0o666 & ~umask)
-        os.replace(temporary.name, target)
+        temporary.write_bytes(content)
+        os.replace(temporary, target)
     except BaseException:
-        Path(temporary.name).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
 
 
