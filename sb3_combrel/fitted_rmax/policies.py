@@ -139,10 +139,11 @@ class FittedRMaxPolicy(BasePolicy):
         # Older files do not have it: there where one arrives decides how episodes end.
         given = {**({"ends": th.tensor([0.0, 1.0])} if strict else expected), **state_dict}
         problems = [problem for name, tensor in expected.items() if (problem := _misfit(name, given.get(name), tensor))]
-        if strict:
-            problems += [f"{name} is unknown" for name in given if name not in expected]
-            if self.transfer is None and any(name.startswith(OF_TRANSFER) for name in given):
-                problems.append("these are parameters of a model with a transfer method: pass the same one, transfer=...")
+        unknown = [name for name in given if strict and name not in expected]
+        if unknown:
+            problems.append(f"unknown are {', '.join(unknown)}")
+        if self.transfer is None and any(name.startswith(OF_TRANSFER) for name in unknown):
+            problems.insert(0, "these are parameters of a model with a transfer method: pass the same one, transfer=...")
         if problems:
             raise RuntimeError(f"parameters do not fit: {'; '.join(problems)}")
         fixed = self.scales.scaling if self.scales.fixed else None
