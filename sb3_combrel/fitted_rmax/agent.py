@@ -155,8 +155,7 @@ class FittedRMaxAgent:
         :param state: unit coordinates, shape (n_variables,)
         :param explore: whether to choose for learning: greedily, ties broken at random, so that optimistic actions come
             first. Otherwise the best of the actions that are known, or else modelled with transferred instances; where a
-            source bounds the values, of all. Values are then those of what is known alone, if it has no source, and the grid
-            is not coarse or all variables have bounds; or if it has been given transitions and has made none itself.
+            source bounds the values, of all; by the values of :meth:`_function_of_frozen`.
         :param environment: in learning, the number of the environment, for a transfer method that decides actions
         :return: the action, from 0 on
         :raises ValueError: if a transfer method decides on something that is no action

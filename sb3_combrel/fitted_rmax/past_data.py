@@ -46,8 +46,7 @@ class PastData(SavedAlgorithm):
         :raises ValueError: if they are of another task, by names or numbers of variables and actions, or are damaged; nothing
             is taken in then
         """
-        found = self._of_this_task(self._read_instances(instances, n_instances))
-        self.policy.take_in(found.states, found.actions, found.rewards, found.next_states, found.terminated)
+        self.policy.take_in(self._of_this_task(self._read_instances(instances, n_instances)))
         if self._last_states is not None:
             # A callback has called this: scales may be other ones now.
             self._last_states = self.policy.to_unit(np.asarray(self._last_obs))

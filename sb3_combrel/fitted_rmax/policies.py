@@ -16,6 +16,7 @@ from sb3_combrel.fitted_rmax.agent import OF_TRANSFER, FittedRMaxAgent
 from sb3_combrel.fitted_rmax.scales import FoundScales
 from sb3_combrel.fitted_rmax.settings import MODELS, FittedRMaxSettings
 from sb3_combrel.models.base import Model
+from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import Transfer
 from sb3_combrel.transfer.by_name import describe_transfer, restore_transfer
 
@@ -60,18 +61,17 @@ class FittedRMaxPolicy(BasePolicy):
         self.to_unit = self.scales.to_unit
         self._first_action = int(action_space.start)
 
-    def take_in(
-        self, states: np.ndarray, actions: np.ndarray, rewards: np.ndarray, next_states: np.ndarray, terminated: np.ndarray
-    ) -> None:
-        """Learn from n past transitions, in their order, or from none; raw units, actions from 0 on."""
+    def take_in(self, past: SourceInstances) -> None:
+        """Learn from past transitions of the same variables and actions, in their order, or from none."""
         before = self._learned()
         # As Stable-Baselines3 hands over an environment's: rewards that differ by their rounding alone tell no states apart.
-        rewards = rewards.astype(np.float32).astype(np.float64)
+        rewards = past.rewards.astype(np.float32).astype(np.float64)
         try:
-            for observations in (states, next_states):
+            for observations in (past.states, past.next_states):
                 self.to_unit(observations, note=True)
             self.follow_scales(episode_ended=True)
-            each = self.to_unit(states), actions.tolist(), rewards.tolist(), self.to_unit(next_states), terminated.tolist()
+            states, next_states = self.to_unit(past.states), self.to_unit(past.next_states)
+            each = states, past.actions.tolist(), rewards.tolist(), next_states, past.terminated.tolist()
             self.agent.take_in(list(zip(*each, strict=True)))
         except BaseException:
             # An interrupt must not leave a part of them behind, which a second attempt would double.
