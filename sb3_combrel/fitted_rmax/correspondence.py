@@ -19,20 +19,22 @@ class Correspondence:
     """
 
     def __init__(self, scaling: StateScaling, bounds: StateScaling):
+        #: Whether they are the same coordinates: then nothing is computed.
+        self.same = scaling == bounds
         given = bounds.high - bounds.low
         self._factor, self._offset = (scaling.high - scaling.low) / given, (scaling.low - bounds.low) / given
 
     def states(self, states: np.ndarray) -> np.ndarray:
         """States of the learner as a transfer method sees them, shape (..., n_variables)."""
-        return np.asarray(states * self._factor + self._offset)
+        return states if self.same else np.asarray(states * self._factor + self._offset)
 
     def effects(self, effects: np.ndarray) -> np.ndarray:
         """Effects of the learner as a transfer method sees them, shape (..., n_variables)."""
-        return np.asarray(effects * self._factor)
+        return effects if self.same else np.asarray(effects * self._factor)
 
     def effects_of_learner(self, effects: np.ndarray) -> np.ndarray:
         """The other way around."""
-        return np.asarray(effects / self._factor)
+        return effects if self.same else np.asarray(effects / self._factor)
 
 
 class OfLearner:
