@@ -81,7 +81,7 @@ def test_a_source_or_a_coarse_grid_without_bounds_leave_it_the_learner_s_own_val
 def test_it_holds_actions_until_they_leave_a_cell_but_on_a_coarse_grid_and_in_learning():
     fine, coarse = line_agent(), line_agent(is_coarse=True)
     assert fine._function_of_frozen().holds and not coarse._function_of_frozen().holds
-    assert not fine._function(fine.planner.values).holds
+    assert not fine._function().holds
 
 
 def test_it_follows_what_is_learned_and_changes_none_of_it():
