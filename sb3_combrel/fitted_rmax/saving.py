@@ -105,7 +105,8 @@ class SavedAlgorithm(BaseAlgorithm):
         :param print_system_info: whether to print system info from the saved model and the current system info
         :param force_reset: force a call to ``reset()`` before training
         :param kwargs: arguments of the constructor to change; ``transfer=`` where a transfer method could not be saved, or the
-            saved one once more; ``instances=`` for more past data. Without ``seed=`` the random number generators continue from their saved states.
+            saved one once more; ``instances=`` for more past data. Without ``seed=`` the random number generators continue
+            from their saved states.
         :return: new model instance with loaded parameters
         :raises FileNotFoundError: if there is no such file
         :raises ValueError: if the file is damaged, was not saved by this class, or does not fit the other arguments
