@@ -102,7 +102,6 @@ class GridModel(Model):
         self._measured = np.zeros((self.n_actions, n)), least_size, np.zeros(n), np.zeros(n)
         self._cell = self.grid.diagonal
         self._points = tuple(PointScratch.empty(self.grid.arrays, len(self.known), n))
-        self._nothing = TransferredInstances.empty(1, self.grid.n_variables)
         self._make_prediction(self._own_room)
         self._renew_arrivals()
 
@@ -123,10 +122,6 @@ class GridModel(Model):
     @abstractmethod
     def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
         """Fit, and write the rows of, (pairs, how many are done); how many are done then, fewer if there is no room."""
-
-    @abstractmethod
-    def _weigh(self, pairs: np.ndarray) -> np.ndarray:
-        """The weight of the own instances of pairs, which decides whether they are known."""
 
     def _make_prediction(self, room: int) -> None:
         self._prediction = Prediction.empty(self.n_actions, room, self.grid.n_variables)
@@ -227,25 +222,28 @@ class GridModel(Model):
         return np.flatnonzero(self.pairs.n_new) if self._giver is None else super().outdated()
 
     def update_rows(self, pairs: np.ndarray) -> None:
-        transferred, done = tuple(self._transferred_to(pairs)), 0
-        while done < len(pairs):
-            done = self._write_rows((pairs, done), transferred)
-            if done < len(pairs):
-                self.mdp.make_room()
-
-    def _transferred_to(self, pairs: np.ndarray) -> TransferredInstances:
-        """Transferred instances for pairs; known ones need none."""
-        if self._giver is None or len(pairs) == 0:
-            if len(self._nothing.length) < len(pairs):
-                self._nothing = TransferredInstances.empty(2 * len(pairs), self.grid.n_variables)
-            return self._nothing
-        actions, points = np.divmod(pairs, self.grid.n_points)
+        if self._giver is None:
+            self._write_all_rows(pairs)
+            return
+        # What their own instances alone say of pairs also shows which of these still lack some.
+        unsure = np.flatnonzero(~self.known[pairs])
+        self._write_all_rows(pairs[unsure])
         # Of what is known the full threshold, so that no method has work with it: grid points may be known with less. And what
         # is known stays known, unless an instance has gone.
-        full, unsure = self.settings.exploration_threshold, np.flatnonzero(~self.known[pairs])
-        own_weight, found = np.full(len(pairs), full), self._weigh(pairs[unsure])
-        own_weight[unsure] = np.where(found >= self._rules[1], np.maximum(full, found), found)
-        return self._giver.transferred_to_sample(points, actions, own_weight)
+        full, found = self.exploration_threshold, self.own_weight[pairs[unsure]]
+        own_weight = np.full(len(pairs), full)
+        own_weight[unsure] = np.where(self.known[pairs[unsure]], np.maximum(full, found), found)
+        actions, points = np.divmod(pairs, self.grid.n_points)
+        self._write_all_rows(pairs, self._giver.transferred_to_sample(points, actions, own_weight))
+
+    def _write_all_rows(self, pairs: np.ndarray, transferred: TransferredInstances | None = None) -> None:
+        """Write the rows of pairs, and make room in the finite MDP where they need more; ``transferred``: to each of them."""
+        given = TransferredInstances.empty(len(pairs), self.grid.n_variables) if transferred is None else transferred
+        done = 0
+        while done < len(pairs):
+            done = self._write_rows((pairs, done), tuple(given))
+            if done < len(pairs):
+                self.mdp.make_room()
 
     def predict_at(self, state: np.ndarray) -> tuple[Prediction, TransferredInstances | None]:
         if self._predict_own(state) >= self.exploration_threshold or self._giver is None:

@@ -78,25 +78,6 @@ def predict_own(instances, state, kernel, threshold, near, prediction):
     return least
 
 
-@entry_point
-def weigh(instances, pairs, grid, kernel, threshold, which, near, found):
-    """Write the weight of the instances of some pairs, ``which``, to ``found``; plain tuples."""
-    instances, pairs, grid, near = Instances(*instances), PairArrays(*pairs), GridArrays(*grid), NearList(*near)
-    n_points = grid.shape[0] * grid.strides[0]
-    for k in range(len(which)):
-        _, total = near_pair(which[k], instances, pairs, grid, kernel, near)
-        found[k] = weight_ever(instances, which[k] // n_points, near.at, kernel, threshold, total)
-
-
-@inlined
-def near_pair(pair, instances, pairs, grid, kernel, near):
-    """Find the instances that the kernel keeps at a pair: see ``near_instances``; ``near.at`` receives its state."""
-    n_points = grid.shape[0] * grid.strides[0]
-    unit_coordinates_of(pair % n_points, grid, near.at)
-    # Instances only come nearer, but for those that are removed (see grid_points.look_at).
-    return near_instances(instances, pair // n_points, near.at, pairs.reach[pair], kernel, near.item, near.weight)
-
-
 @inlined
 def entry_distance(near, length, total, kernel, threshold, known):
     """The squared distance within which an instance changes a list, or whether a pair that is not known yet is known.
@@ -128,7 +109,9 @@ def update_rows(instances, pairs, mdp, grid, kernel, planned, which, transferred
         pair = which[done]
         point = pair % n_points
         action = pair // n_points
-        length, total = near_pair(pair, instances, pairs, grid, kernel, near)
+        unit_coordinates_of(point, grid, near.at)
+        # Instances only come nearer, but for those that are removed (see grid_points.look_at).
+        length, total = near_instances(instances, action, near.at, pairs.reach[pair], kernel, near.item, near.weight)
         weight = weight_ever(instances, action, near.at, kernel, threshold, total)
         known = note_fit(pair, length, weight, threshold, transitions, pairs)
         pairs.reach[pair] = entry_distance(near, length, total, kernel, threshold, known)
@@ -178,12 +161,6 @@ class KernelAverage(GridModel):
         mdp, planned = self.mdp, (self.mdp.gamma, self._rules[1], self.n_added)
         model = self._plain_experience[0], self._plain_pairs, mdp.plain, self.grid.plain, self._weights
         return int(update_rows.call(*model, planned, pairs, transferred, mdp.plain_scratch, self._near))
-
-    def _weigh(self, pairs: np.ndarray) -> np.ndarray:
-        found, threshold = np.empty(len(pairs)), self.exploration_threshold
-        model = self._plain_experience[0], self._plain_pairs, self.grid.plain, self._weights
-        weigh.call(*model, threshold, pairs, self._near, found)
-        return found
 
     def _predict_own(self, state: np.ndarray) -> float:
         given = state, self._weights, self.exploration_threshold, self._near, self._plain_prediction

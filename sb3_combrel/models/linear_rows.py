@@ -141,18 +141,6 @@ def predict_alone(instances, kernel, state, action, fit, scratch, effect):
     return leverage_of(fit, length, kernel)
 
 
-@entry_point
-def weigh(instances, pairs, grid, kernel, which, fit, at, found):
-    """Write the weight of the instances of some pairs, ``which``, to ``found``; ``at``: work space; plain tuples."""
-    instances, pairs, grid = Instances(*instances), PairArrays(*pairs), GridArrays(*grid)
-    kernel, fit = Kernel(*kernel), LocalFit(*fit)
-    n_points = grid.shape[0] * grid.strides[0]
-    for k in range(len(which)):
-        unit_coordinates_of(which[k] % n_points, grid, at)
-        length = nearest_instances(instances, which[k] // n_points, at, pairs.reach[which[k]], fit.item, fit.distance)
-        found[k] = known_weight(fit, length, kernel)
-
-
 @inlined
 def take_step(fit, grid, at, scratch):
     """Write the effect of the next step to ``scratch.step``, within the grid; the part of it until the cell is left."""

@@ -17,7 +17,6 @@ from sb3_combrel.models.linear_rows import (
     predict_alone,
     predict_own,
     update_rows,
-    weigh,
 )
 from sb3_combrel.planning.mdp import FiniteMDP
 
@@ -95,12 +94,6 @@ class LocalLinear(GridModel):
         model = self._plain_experience, self._plain_linear, self._plain_pairs, mdp.plain, self.grid.plain, self._plain_kernel
         scratch = mdp.plain_scratch, self._fit, self._scratch
         return int(update_rows.call(*model, planned, pairs, transferred, *scratch))
-
-    def _weigh(self, pairs: np.ndarray) -> np.ndarray:
-        found, at = np.empty(len(pairs)), np.empty(self.grid.n_variables)
-        model = self._plain_experience[0], self._plain_pairs, self.grid.plain, self._plain_kernel
-        weigh.call(*model, pairs, self._fit, at, found)
-        return found
 
     def predict_alone(self, state: np.ndarray, action: int) -> tuple[np.ndarray, float]:
         found = np.zeros(self.grid.n_variables)
