@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -45,6 +45,18 @@ class TranslationScratch(NamedTuple):
     full: np.ndarray  # bool, shape (1,): an instance that was needed did not fit
     enters: np.ndarray  # float64, shape (1,): an instance of no higher rank than this is not needed
 
+    @classmethod
+    def empty(cls, room: int, n_variables: int) -> TranslationScratch:
+        return cls(
+            number=np.empty((room, 2), dtype=np.int64),
+            value=np.empty((room, 2)),
+            variable=np.empty(n_variables, dtype=np.int64),
+            at=np.empty(n_variables),
+            periodic=np.zeros(n_variables, dtype=np.bool_),
+            full=np.zeros(1, dtype=np.bool_),
+            enters=np.zeros(1),
+        )
+
 
 class TranslationArrays(NamedTuple):
     """All that the translator's loops read, and their work space."""
@@ -57,19 +69,6 @@ class TranslationArrays(NamedTuple):
     scratch: TranslationScratch
     periodic: np.ndarray  # bool, shape (n_target_variables,): the target's variables that wrap
 
-    def plain(self) -> tuple[Any, ...]:
-        """The same as plain tuples (see ``common.compiled``)."""
-        structs = tuple(self.source), tuple(self.candidates), tuple(self.mappings), tuple(self.rules)
-        return *structs, self.relevance, tuple(self.scratch), self.periodic
-
-
-@inlined
-def as_arrays(plain):
-    """:class:`TranslationArrays` from plain tuples."""
-    source, candidates, mappings = Instances(*plain[0]), CandidateArrays(*plain[1]), MappingTable(*plain[2])
-    rules, scratch = TranslationRules(*plain[3]), TranslationScratch(*plain[5])
-    return TranslationArrays(source, candidates, mappings, rules, plain[4], scratch, plain[6])
-
 
 @inlined
 def insert_selected(j, candidate, weight, rank, own, kept, rules, scratch):
@@ -78,7 +77,7 @@ def insert_selected(j, candidate, weight, rank, own, kept, rules, scratch):
     An instance is needed while those before it and ``own`` do not reach the threshold, and while it has at least
     ``min_fraction`` of their weight. These sums only grow, so what is cut once would be cut for ever.
 
-    :return: how many are kept now, and the least weight with which a further instance could enter (by weight)
+    :return: how many are kept now; ``scratch.enters`` receives the least rank with which a further one could enter
     """
     number, value = scratch.number, scratch.value
     room = len(value) - 1
@@ -97,15 +96,18 @@ def insert_selected(j, candidate, weight, rank, own, kept, rules, scratch):
     for k in range(min(kept + 1, room)):
         if not rules.by_relevance and value[k, _WEIGHT] < rules.min_fraction * total:
             # Heavier than the last of the list, one need not have that fraction of the last's weight as well.
-            enters = rules.min_fraction * total
-            return k, min(enters, value[k - 1, _WEIGHT]) if k > 0 else enters
+            least = rules.min_fraction * total
+            scratch.enters[0] = min(least, value[k - 1, _WEIGHT]) if k > 0 else least
+            return k
         total += value[k, _WEIGHT]
         if total >= rules.threshold:
             scratch.enters[0] = value[k, _RANK]
-            return k + 1, value[k, _WEIGHT]
+            return k + 1
     if kept + 1 > room:
         scratch.full[0] = True
-    return min(kept + 1, room), value[room - 1, _WEIGHT] if kept + 1 >= room else 0.0
+    if not rules.by_relevance:
+        scratch.enters[0] = value[room - 1, _WEIGHT] if kept + 1 >= room else 0.0
+    return min(kept + 1, room)
 
 
 @inlined
@@ -150,12 +152,10 @@ def add_near_instances(state, own, candidate, arrays, kept):
                 rank = 1.0 if by_relevance_alone else weight
                 if rules.by_relevance:
                     rank *= arrays.relevance[candidate, j]
-                kept, enters = insert_selected(j, candidate, weight, rank, own, kept, rules, scratch)
-                if rules.times_weight:
+                kept = insert_selected(j, candidate, weight, rank, own, kept, rules, scratch)
+                if scratch.enters[0] > rules.min_weight and not by_relevance_alone:
                     # No relevance exceeds 1: what is lighter than the least rank that is needed has a lower one.
-                    enters = scratch.enters[0]
-                if enters > rules.min_weight and not by_relevance_alone:
-                    nearest = np.log(enters) / scale * (1 + 1e-12)
+                    nearest = np.log(scratch.enters[0]) / scale * (1 + 1e-12)
     return kept
 
 
@@ -212,10 +212,13 @@ def translate(states, own, ranges, arrays, transferred):
 
     :param own: weight of the target's own instances there
     :param ranges: (first candidate whose instances may be used, one past the last: none if equal)
-    :param arrays: ``TranslationArrays.plain``
+    :param arrays: TranslationArrays; plain tuples
     :param transferred: TransferredInstances as a plain tuple, receives the instances, at least n rows
     """
-    arrays, transferred = as_arrays(arrays), TransferredInstances(*transferred)
+    source, candidates, mappings = Instances(*arrays[0]), CandidateArrays(*arrays[1]), MappingTable(*arrays[2])
+    rules, scratch = TranslationRules(*arrays[3]), TranslationScratch(*arrays[5])
+    arrays = TranslationArrays(source, candidates, mappings, rules, arrays[4], scratch, arrays[6])
+    transferred = TransferredInstances(*transferred)
     first, last = ranges
     for s in range(len(own)):
         transferred.length[s] = 0
@@ -238,63 +241,43 @@ class Translator:
         self, candidates: Candidates, *, breadth: float, transfer_terminals: bool, by_relevance: bool, times_weight: bool
     ):
         task, largest = candidates.task, int(candidates.instances.size.max())
-        self._max_instances = min(list_room(task.min_fraction), MAX_TRANSFERRED)
-        self._n_variables = task.n_variables
-        self._set_arrays(
-            TranslationArrays(
-                source=candidates.instances,
-                candidates=candidates.arrays,
-                mappings=candidates.table,
-                rules=TranslationRules(
-                    threshold=float(task.exploration_threshold),
-                    breadth=float(breadth),
-                    min_weight=float(task.min_weight),
-                    min_fraction=float(task.min_fraction),
-                    transfer_terminals=transfer_terminals,
-                    by_relevance=by_relevance,
-                    times_weight=times_weight,
-                ),
-                relevance=np.ones((len(candidates), largest)) if by_relevance else np.empty((1, 0)),
-                scratch=self._make_scratch(),
-                periodic=np.array(task.periodic),
-            )
+        self._source = candidates.instances, candidates.arrays, candidates.table
+        self._periodic = np.array(task.periodic)
+        #: When and how instances are translated.
+        self.rules = TranslationRules(
+            threshold=float(task.exploration_threshold),
+            breadth=float(breadth),
+            min_weight=float(task.min_weight),
+            min_fraction=float(task.min_fraction),
+            transfer_terminals=transfer_terminals,
+            by_relevance=by_relevance,
+            times_weight=times_weight,
         )
-        self._make_room(task.n_actions)
+        #: Relevance of each candidate's instances, which is written to from outside.
+        self.relevance = np.ones((len(candidates), largest)) if by_relevance else np.empty((1, 0))
+        self._make_room(task.n_actions, min(list_room(task.min_fraction), MAX_TRANSFERRED))
 
-    def _set_arrays(self, arrays: TranslationArrays) -> None:
-        # Plain tuples for compiled code are made once, not at every step (see ``common.compiled``).
-        self._arrays, self._plain_arrays = arrays, arrays.plain()
-        #: When and how instances are translated; and their relevance, which is written to from outside.
-        self.rules, self.relevance = arrays.rules, arrays.relevance
-
-    def _make_scratch(self) -> TranslationScratch:
-        return TranslationScratch(
-            number=np.empty((self._max_instances + 1, 2), dtype=np.int64),
-            value=np.empty((self._max_instances + 1, 2)),
-            variable=np.empty(self._n_variables, dtype=np.int64),
-            at=np.empty(self._n_variables),
-            periodic=np.zeros(self._n_variables, dtype=np.bool_),
-            full=np.zeros(1, dtype=np.bool_),
-            enters=np.zeros(1),
-        )
-
-    def _make_room(self, n: int) -> None:
-        self._transferred = TransferredInstances.empty(n, self._n_variables, self._max_instances)
-        self._plain_transferred = tuple(self._transferred)
+    def _make_room(self, n: int, max_instances: int) -> None:
+        """Make room for so many instances of each of ``n`` states and actions."""
+        n_variables = len(self._periodic)
+        self._scratch = TranslationScratch.empty(max_instances + 1, n_variables)
+        self._transferred = TransferredInstances.empty(n, n_variables, max_instances)
 
     def set_breadth(self, breadth: float) -> None:
         """Translate with another kernel breadth from now on."""
-        self._set_arrays(self._arrays._replace(rules=self.rules._replace(breadth=breadth)))
+        self.rules = self.rules._replace(breadth=breadth)
 
     def __call__(self, states: np.ndarray, own_weight: np.ndarray, ranges: Ranges) -> TransferredInstances:
         """Translate instances for states and actions, see :func:`translate`, in arrays that the next call uses again."""
-        if len(own_weight) > len(self._transferred.length):
-            self._make_room(2 * len(own_weight))
-        translate.call(states, own_weight, ranges, self._plain_arrays, self._plain_transferred)
-        # The most relevant instances may be far and light: cut off, they would not reach the threshold together.
-        while self.rules.by_relevance and self._arrays.scratch.full[0]:
-            self._max_instances *= 2
-            self._set_arrays(self._arrays._replace(scratch=self._make_scratch()))
-            self._make_room(len(self._transferred.length))
-            translate.call(states, own_weight, ranges, self._plain_arrays, self._plain_transferred)
-        return self._transferred
+        n, room = self._transferred.weight.shape
+        if len(own_weight) > n:
+            self._make_room(2 * len(own_weight), room)
+        while True:
+            structs = map(tuple, (*self._source, self.rules))
+            arrays = *structs, self.relevance, tuple(self._scratch), self._periodic
+            translate.call(states, own_weight, ranges, arrays, tuple(self._transferred))
+            # The most relevant instances may be far and light: cut off, they would not reach the threshold together.
+            if not (self.rules.by_relevance and self._scratch.full[0]):
+                return self._transferred
+            n, room = self._transferred.weight.shape
+            self._make_room(n, 2 * room)
