@@ -26,22 +26,20 @@ DEFAULT_MIN_EVIDENCE = 0.1
 class ComplianceScratch(NamedTuple):
     """Work space, and the state mappings in the form that the inner loop reads; n is the most instances of an action.
 
-    A *factor* is a combination of a target variable, a source variable and (not) mirrored that some mapping uses; a *start
-    factor* is one with a start bandwidth.
+    A *factor* is a combination of a target variable, a source variable, (not) mirrored and a start bandwidth that some mapping
+    uses.
     """
 
     variable: np.ndarray  # int64, shape (n_factors,): target variable
     source: np.ndarray  # int64, same shape: source variable
     mirrored: np.ndarray  # bool, same shape
+    bandwidth: np.ndarray  # float64, same shape: start bandwidth
     first: np.ndarray  # int64, shape (n_state_mappings + 1,): mapping m has factors[first[m] : first[m + 1]]
     factors: np.ndarray  # int64
-    starts: np.ndarray  # int64, same shape: the same for start factors
-    start_factor: np.ndarray  # int64, shape (n_start_factors,): the factor of each
-    start_bandwidth: np.ndarray  # float64, same shape
     state: np.ndarray  # float64, shape (n_source_actions, n_source_variables, n): the instances' states by variable
     effect: np.ndarray  # the same of their effects
-    start: np.ndarray  # float64, shape (n_start_factors, n): kernel of where a transition and each instance start
-    outcome: np.ndarray  # float64, shape (n_factors, n): the same for outcomes
+    start: np.ndarray  # float64, shape (n_factors, n): kernel of where a transition and each instance start
+    outcome: np.ndarray  # the same for outcomes
     reward: np.ndarray  # float64, shape (n,): the same for rewards
     weight: np.ndarray  # float64, shape (n,): product of a mapping's start kernels
     hit: np.ndarray  # the same of its outcome kernels
@@ -59,29 +57,24 @@ class ComplianceScratch(NamedTuple):
     ) -> "ComplianceScratch":
         """Make work space; ``start``: start bandwidth, of all mappings or of each, shape (n_state_mappings,)."""
         largest = int(source.size.max())
-        number: dict[tuple[int, int, bool], int] = {}
-        start_number: dict[tuple[int, float], int] = {}
-        first, factors, starts = [0], [], []
+        number: dict[tuple[int, int, bool, float], int] = {}
+        first, factors = [0], []
         of_mapping = np.broadcast_to(start, len(mappings.variable))
         for index, sign, bandwidth in zip(mappings.variable, mappings.sign, of_mapping.tolist(), strict=True):
-            for v in np.flatnonzero(index >= 0):
-                factors.append(number.setdefault((int(v), int(index[v]), bool(sign[v] < 0.0)), len(number)))
-                starts.append(start_number.setdefault((factors[-1], bandwidth), len(start_number)))
+            for v in np.flatnonzero(index >= 0).tolist():
+                factors.append(number.setdefault((v, int(index[v]), bool(sign[v] < 0.0), bandwidth), len(number)))
             first.append(len(factors))
-        keys = list(number)
         return cls(
-            variable=np.array([v for v, _, _ in keys], dtype=np.int64),
-            source=np.array([k for _, k, _ in keys], dtype=np.int64),
-            mirrored=np.array([m for _, _, m in keys], dtype=np.bool_),
+            variable=np.array([v for v, _, _, _ in number], dtype=np.int64),
+            source=np.array([k for _, k, _, _ in number], dtype=np.int64),
+            mirrored=np.array([m for _, _, m, _ in number], dtype=np.bool_),
+            bandwidth=np.array([bandwidth for _, _, _, bandwidth in number]),
             first=np.array(first, dtype=np.int64),
             factors=np.array(factors, dtype=np.int64),
-            starts=np.array(starts, dtype=np.int64),
-            start_factor=np.array([f for f, _ in start_number], dtype=np.int64),
-            start_bandwidth=np.array([bandwidth for _, bandwidth in start_number]),
             state=np.ascontiguousarray(source.state[:, :largest].transpose(0, 2, 1)),
             effect=np.ascontiguousarray(source.effect[:, :largest].transpose(0, 2, 1)),
-            start=np.empty((len(start_number), largest)),
-            outcome=np.empty((len(keys), largest)),
+            start=np.empty((len(number), largest)),
+            outcome=np.empty((len(number), largest)),
             reward=np.empty(largest),
             weight=np.empty(largest),
             hit=np.empty(largest),
@@ -147,16 +140,11 @@ def _kernel_factors(state, effect, reward, source, action, bandwidths, scratch):
         k = scratch.source[f]
         side = -1.0 if scratch.mirrored[f] else 1.0
         periodic = scratch.periodic[v]
+        at = 1.0 - state[v] if scratch.mirrored[f] else state[v]
+        _squares(at, scratch.state[action, k], scratch.bandwidth[f], periodic, scratch.start[f], n)
+        _exponentiate(scratch.start[f], n)
         _squares(side * effect[v], scratch.effect[action, k], bandwidths.outcome, periodic, scratch.outcome[f], n)
         _exponentiate(scratch.outcome[f], n)
-    for s in range(len(scratch.start_factor)):
-        f = scratch.start_factor[s]
-        at = state[scratch.variable[f]]
-        at = 1.0 - at if scratch.mirrored[f] else at
-        periodic = scratch.periodic[scratch.variable[f]]
-        of_source = scratch.state[action, scratch.source[f]]
-        _squares(at, of_source, scratch.start_bandwidth[s], periodic, scratch.start[s], n)
-        _exponentiate(scratch.start[s], n)
     for j in range(n):
         off = reward - source.reward[action, j]
         scratch.reward[j] = off * off / bandwidths.reward
@@ -171,9 +159,8 @@ def _mapping_compliance(m, n, scratch):
         scratch.hit[j] = 1.0
     for t in range(scratch.first[m], scratch.first[m + 1]):
         f = scratch.factors[t]
-        s = scratch.starts[t]
         for j in range(n):
-            scratch.weight[j] *= scratch.start[s, j]
+            scratch.weight[j] *= scratch.start[f, j]
             scratch.hit[j] *= scratch.outcome[f, j]
     total = 0.0
     transition = 0.0
