@@ -48,7 +48,7 @@ class ComplianceSelector(Selector):
         super().__init__(candidates)
         self.options, self.rng, self.max_transitions = options, rng, options.max_transitions
         n_actions, n_points = self.task.n_actions, len(self.task.sample_states)
-        n_neighbors = options.n_neighbors
+        n_pairs, n_neighbors = n_actions * n_points, options.n_neighbors
         # An empty place counts as a neighbour at the limit: what is farther away does not enter.
         limit = np.inf if options.neighbor_radius is None else float(options.neighbor_radius) ** 2
         self._limits = float(self.task.exploration_threshold), limit
@@ -58,35 +58,21 @@ class ComplianceSelector(Selector):
         # Where in the table the candidates of each action stand.
         columns = candidates.arrays.row * len(candidates.instances.size) + candidates.arrays.action
         self._columns = np.split(columns, self.first[1:-1])
-        self._set_cache(ComplianceCache.empty(int(np.diff(self.first).max())))
+        self._cache = ComplianceCache.empty(int(np.diff(self.first).max()))
         self._listed = np.empty((n_actions, 64), dtype=np.int64)
         self._n_listed = np.zeros(n_actions, dtype=np.int64)
         # Variable by variable: the loop over all states reads them in a row.
         self._periodic = np.array(self.task.periodic)
         self._sample = np.ascontiguousarray(self.task.sample_states.T), self._periodic
         self._apart = np.empty(n_points)
-        self._near = np.full((n_actions, n_points, n_neighbors), -1, dtype=np.int64)
-        self._distance = np.full((n_actions, n_points, n_neighbors), limit)
-        self._choice = np.full(n_actions * n_points, -1, dtype=np.int64)
-        self._due = np.zeros((n_actions, n_points), dtype=np.bool_)
+        # Of the pairs of the sample: their nearest transitions, how far these are, what is chosen, and whether that is due.
+        self._near = np.full((n_pairs, n_neighbors), -1, dtype=np.int64)
+        self._distance = np.full((n_pairs, n_neighbors), limit)
+        self._choice = np.full(n_pairs, -1, dtype=np.int64)
+        self._due = np.zeros(n_pairs, dtype=np.bool_)
         self._renewal_due = 0.0
         # Nothing is asked before the first transition. To draw here would change what a loaded model draws.
         self._draws_at = np.zeros(n_actions) if options.drawn else NO_DRAWS
-        self._make_room_at(n_actions)
-
-    @property
-    def _near_of_pair(self) -> np.ndarray:
-        """Of each pair, the same array: a copy of the selector has its own."""
-        return self._near.reshape(-1, self.options.n_neighbors)
-
-    def _set_cache(self, cache: ComplianceCache) -> None:
-        self._cache, self._plain_cache = cache, tuple(cache)
-
-    def _make_room_at(self, n: int) -> None:
-        """Make work space for ``n`` exact states: nearest transitions, their distances, and the candidates selected."""
-        shape = n, self.options.n_neighbors
-        first, last = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
-        self._found_at = np.empty(shape, dtype=np.int64), np.empty(shape), first, last
 
     def before_transition(self) -> None:
         # With each transition, not with each question: a prediction asked for twice is the same, and leaves no trace.
@@ -123,49 +109,48 @@ class ComplianceSelector(Selector):
             self._cache.measured[i] = True
 
     def select(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
-        n = len(actions)
-        if n > len(self._found_at[0]):
-            self._make_room_at(2 * n)
-        near, _, first, last = self._found_at
+        n, n_neighbors = len(actions), self.options.n_neighbors
+        near, distance = np.empty((n, n_neighbors), dtype=np.int64), np.empty((n, n_neighbors))
+        ranges = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
         query = states, actions, own_weight
         recorded = self.transitions.states, self._listed, self._n_listed, self._periodic
-        while not select.call(query, recorded, self._limits, self._plain_cache, self.first, self._draws_at, self._found_at):
-            self._measure(near[:n])
-        return first[:n], last[:n]
+        given = query, recorded, self._limits, tuple(self._cache), self.first, self._draws_at
+        while not select.call(*given, (near, distance, *ranges)):
+            self._measure(near)
+        return ranges
 
     def select_at_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> Ranges:
-        return ranges_of(self._choice[actions * self._near.shape[1] + points])
+        return ranges_of(self._choice[actions * len(self.task.sample_states) + points])
 
     def changed(self, known: np.ndarray) -> bool | np.ndarray:
         if self.transitions.n < self._renewal_due:
             return False
         self._renewal_due = CHOICE_GROWTH * self.transitions.n
-        due = np.flatnonzero(self._due & ~known)
         changed = np.zeros(known.shape, dtype=np.bool_)
-        changed.ravel()[self._renew(due)] = True
+        changed.ravel()[self._renew(np.flatnonzero(self._due & ~known.ravel()))] = True
         return changed
 
     def _use(self, i: int) -> None:
         """Make transition ``i`` a neighbour for its action, or for all, also of sample states."""
         if i >= len(self._cache.required):
-            self._set_cache(self._cache.grown())
+            self._cache = self._cache.grown()
         for action in range(self.task.n_actions) if self.options.all_actions else [int(self.transitions.actions[i])]:
             n = self._n_listed[action]
             if n == self._listed.shape[1]:
                 self._listed = np.concatenate([self._listed, np.empty_like(self._listed)], axis=1)
             self._listed[action, n] = i
             self._n_listed[action] += 1
-            near, distance, due = self._near[action], self._distance[action], self._due[action]
-            add_to_sample.call(i, self.transitions.states[i], self._sample, near, distance, due, self._apart)
+            pairs = slice(action * len(self._apart), (action + 1) * len(self._apart))
+            of_action = self._near[pairs], self._distance[pairs], self._due[pairs]
+            add_to_sample.call(i, self.transitions.states[i], self._sample, *of_action, self._apart)
 
     def _renew(self, pairs: np.ndarray) -> np.ndarray:
         """Renew the choices of pairs of the sample; return those that changed."""
-        near = self._near_of_pair
-        self._measure(near[pairs])
+        self._measure(self._near[pairs])
         rows, actions = pairs.copy(), pairs // len(self.task.sample_states)
         draws = self._draws(len(pairs))
-        n_changed = int(choose.call(rows, actions, near, self._plain_cache, self.first, draws, self._choice))
-        self._due.ravel()[pairs] = False
+        n_changed = int(choose.call(rows, actions, self._near, tuple(self._cache), self.first, draws, self._choice))
+        self._due[pairs] = False
         self.n_switches += n_changed
         return rows[:n_changed]
 
@@ -178,11 +163,11 @@ class ComplianceSelector(Selector):
 
     def mean_compliance(self, pairs: np.ndarray) -> np.ndarray:
         """Return the mean compliance of the chosen candidate of pairs of the sample (line 19); NaN where nothing is chosen."""
-        near = self._near_of_pair[pairs]
+        near = self._near[pairs]
         self._measure(near)
         chosen = self._choice[pairs]
         counted = (near >= 0) & (chosen >= 0)[:, None]
-        column = np.maximum(chosen - self.first[pairs // self._near.shape[1]], 0)
+        column = np.maximum(chosen - self.first[pairs // len(self.task.sample_states)], 0)
         compliance = self._cache.compliance[np.maximum(near, 0), column[:, None]]
         n_counted = counted.sum(axis=1)
         total = np.where(counted, compliance, 0.0).sum(axis=1)
@@ -197,11 +182,11 @@ class ComplianceSelector(Selector):
             return None
         if len(pairs) > MAX_COMPARED:
             pairs = pairs[(np.arange(MAX_COMPARED) * (len(pairs) / MAX_COMPARED)).astype(np.int64)]
-        self._measure(self._near_of_pair[pairs])
+        self._measure(self._near[pairs])
         n_candidates = int(self.first[action + 1] - self.first[action])
         compared = np.empty((len(pairs), 3))
         for row, pair in enumerate(pairs.tolist()):
-            near = self._near_of_pair[pair]
+            near = self._near[pair]
             near = near[near >= 0]
             mean = self._cache.compliance[near, :n_candidates].mean(axis=0)
             chosen = int(self._choice[pair] - self.first[action])
@@ -217,7 +202,7 @@ class ComplianceSelector(Selector):
             "renewal_due": np.array([float(self._renewal_due)]),
             "switches": np.array([float(self.n_switches)]),
             "choice": self._choice.astype(np.float64),
-            "vote_due": self._due.ravel().astype(np.float64),
+            "vote_due": self._due.astype(np.float64),
             "draws_at": self._draws_at,
         }
 
@@ -228,7 +213,7 @@ class ComplianceSelector(Selector):
         first, last = self.first[:-1, None], self.first[1:, None] - 1
         chosen = state["choice"].astype(np.int64).reshape(self.task.n_actions, -1)
         self._choice[:] = np.where(chosen < 0, -1, np.clip(chosen, first, last)).ravel()
-        self._due.ravel()[:] = state["vote_due"] > 0.5
+        self._due[:] = state["vote_due"] > 0.5
         self._draws_at = np.clip(state["draws_at"], 0.0, 1.0)
         self._renewal_due = float(state["renewal_due"][0])
         self.n_switches = int(state["switches"][0])

@@ -71,7 +71,7 @@ def find_nearest(query, recorded, limits, near, distance):
     :param recorded: (states of the transitions; those that count for each action, int64, shape (n_actions, capacity); how many
         these are, shape (n_actions,); periodic, bool, shape (n_variables,))
     :param limits: (threshold, squared distance from which on a transition does not count)
-    :param near: receives the transitions, the nearest first, -1 for none, int64, shape (at least n, n_neighbors)
+    :param near: receives the transitions, the nearest first, -1 for none, int64, shape (n, n_neighbors)
     """
     states, actions, own_weight = query
     at, listed, n_listed, periodic = recorded
@@ -174,7 +174,7 @@ def select(query, recorded, limits, cache, first, draws, found):
 
     :param query: as ``recorded`` and ``limits``: see :func:`find_nearest`
     :param draws: a random number for each action; or nothing; the rest as in :func:`choose`
-    :param found: (nearest transitions, their distances, first candidate, one past the last: none if equal), at least n of each
+    :param found: (nearest transitions, their distances, first candidate, one past the last: none if equal), n of each
     :return: whether all nearest transitions have been measured; otherwise nothing is chosen
     """
     cache = ComplianceCache(*cache)
