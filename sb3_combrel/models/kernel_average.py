@@ -13,8 +13,8 @@ from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.models.base import InstanceTransfer, ModelSettings
 from sb3_combrel.models.grid_model import GridModel, add_to_row, total_weight
 from sb3_combrel.models.grid_points import PairArrays, note_fit
-from sb3_combrel.planning.grid import GridArrays, unit_coordinates_of
-from sb3_combrel.planning.mdp import FiniteMDP, MDPArrays, RowScratch, add_successor, coordinates_of, finish_row, set_modelled
+from sb3_combrel.planning.grid import GridArrays, coordinates_of, unit_coordinates_of
+from sb3_combrel.planning.mdp import FiniteMDP, MDPArrays, RowScratch, add_successor, finish_row, set_modelled
 from sb3_combrel.planning.q_values import Prediction
 
 
@@ -109,7 +109,8 @@ def update_rows(instances, pairs, mdp, grid, kernel, planned, which, transferred
         pair = which[done]
         point = pair % n_points
         action = pair // n_points
-        unit_coordinates_of(point, grid, near.at)
+        coordinates_of(point, grid, row_scratch.at)
+        unit_coordinates_of(row_scratch.at, grid, near.at)
         # Instances only come nearer, but for those that are removed (see grid_points.look_at).
         length, total = near_instances(instances, action, near.at, pairs.reach[pair], kernel, near.item, near.weight)
         weight = weight_ever(instances, action, near.at, kernel, threshold, total)
@@ -117,7 +118,6 @@ def update_rows(instances, pairs, mdp, grid, kernel, planned, which, transferred
         pairs.reach[pair] = entry_distance(near, length, total, kernel, threshold, known)
         joined = not known and transferred.length[done] > 0
         if known or joined:
-            coordinates_of(point, grid, row_scratch.at)
             if joined:
                 total = total_weight(total, transferred, done)
             reward = 0.0

@@ -22,8 +22,16 @@ from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.models.ends import Ends, end_at, far_from_ends, squared_distance_of_end
 from sb3_combrel.models.grid_model import add_to_row, total_weight
 from sb3_combrel.models.grid_points import PairArrays, note_fit
-from sb3_combrel.planning.grid import GridArrays, cell_width, corners_of, grid_coordinates, unit_coordinates_of, unit_of_line
-from sb3_combrel.planning.mdp import MDPArrays, RowScratch, add_successor, coordinates_of, finish_row, set_modelled
+from sb3_combrel.planning.grid import (
+    GridArrays,
+    cell_width,
+    coordinates_of,
+    corners_of,
+    grid_coordinates,
+    unit_coordinates_of,
+    unit_of_line,
+)
+from sb3_combrel.planning.mdp import MDPArrays, RowScratch, add_successor, finish_row, set_modelled
 from sb3_combrel.planning.q_values import Prediction
 
 # In parts of a cell: an effect of less is none.
@@ -246,8 +254,8 @@ def update_rows(experience, linear, pairs, mdp, grid, kernel, planned, which, tr
         pair = which[done]
         point = pair % n_points
         action = pair // n_points
-        unit_coordinates_of(point, grid, scratch.at)
         coordinates_of(point, grid, row_scratch.at)
+        unit_coordinates_of(row_scratch.at, grid, scratch.at)
         length, weight = pairs.length[pair], pairs.weight[pair]
         kept = has_prior and pairs.known[pair] and pairs.n_new[pair] == 0 and length > 0
         if not kept:

@@ -85,20 +85,19 @@ def cells_away(line, away, k, grid):
 
 
 @inlined
-def unit_coordinates_of(point, grid, at):
-    """Write the unit coordinates of a grid point to ``at``."""
-    for k in range(len(at)):
-        along = point // grid.strides[k]
-        point -= along * grid.strides[k]
-        at[k] = unit_of_line(along, k, grid)
+def coordinates_of(point, grid, at):
+    """Write the whole-numbered grid coordinates of a point to ``at``."""
+    rest = point
+    for k in range(len(grid.shape)):
+        at[k] = rest // grid.strides[k]
+        rest -= at[k] * grid.strides[k]
 
 
 @inlined
-def wrapped(at, n):
-    """A grid coordinate of a periodic variable with ``n`` points, in [0, n)."""
-    at -= n * np.floor(at / n)
-    # A tiny negative one is rounded up to n.
-    return at if at < n else 0.0
+def unit_coordinates_of(at, grid, state):
+    """Write the unit coordinates of a grid point to ``state``, from its grid coordinates ``at``."""
+    for k in range(len(at)):
+        state[k] = unit_of_line(at[k], k, grid)
 
 
 @inlined
@@ -127,7 +126,10 @@ def cell_of(at, k, grid):
     """The cell of a grid coordinate along variable ``k``, wrapped or clipped into the grid; and the part of it beyond."""
     last = grid.shape[k] - 1
     if grid.periodic[k]:
-        at = wrapped(at + ON_LINE, grid.shape[k]) - ON_LINE
+        at += ON_LINE
+        at -= grid.shape[k] * np.floor(at / grid.shape[k])
+        # A tiny negative one is rounded up to the number of points.
+        at = (at if at < grid.shape[k] else 0.0) - ON_LINE
     else:
         at = min(max(at, 0.0), float(last))
     # On a grid line but for rounding: half the corners, and half the work of planning.

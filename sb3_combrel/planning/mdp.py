@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_combrel.common.compiled import compiled, entry_point, inlined
-from sb3_combrel.planning.grid import StateGrid, cells_away, corners_of, n_corners
+from sb3_combrel.planning.grid import StateGrid, cells_away, coordinates_of, corners_of, n_corners
 
 NEVER_LEAVES = 1e-9
 
@@ -102,15 +102,6 @@ class FiniteMDP:
             )
             if done < len(pairs):
                 self.make_room()
-
-
-@inlined
-def coordinates_of(point, grid, at):
-    """Write the whole-numbered grid coordinates of a point to ``at``."""
-    rest = point
-    for k in range(len(grid.shape)):
-        at[k] = rest // grid.strides[k]
-        rest -= at[k] * grid.strides[k]
 
 
 @compiled

@@ -5,17 +5,8 @@ from typing import Any
 import numpy as np
 
 from sb3_combrel.common.compiled import EntryPoint, entry_point, inlined
-from sb3_combrel.planning.grid import GridArrays, next_row
-from sb3_combrel.planning.mdp import FiniteMDP, coordinates_of
-
-
-@inlined
-def value_of_row(values, to, weight, length, reward, point, action):
-    """Reward of a pair that has a model, and the values of its successors."""
-    q = reward[point, action]
-    for k in range(length[point, action]):
-        q += weight[point, action, k] * values[to[point, action, k]]
-    return q
+from sb3_combrel.planning.grid import GridArrays, coordinates_of, next_row
+from sb3_combrel.planning.mdp import FiniteMDP
 
 
 @inlined
@@ -31,7 +22,10 @@ def backed_up(values, mdp, upper, worth, lowest, searching, point):
     if best < upper[point]:
         for action in range(reward.shape[1]):
             if modelled[action * len(values) + point]:
-                best = max(best, value_of_row(values, to, weight, length, reward, point, action))
+                q = reward[point, action]
+                for k in range(length[point, action]):
+                    q += weight[point, action, k] * values[to[point, action, k]]
+                best = max(best, q)
         best = min(best, upper[point])
     return best
 
