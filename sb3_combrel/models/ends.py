@@ -49,17 +49,6 @@ def put_arrival(instances, arrivals, action, slot):
         arrivals.block_high[action, k, block] = max(arrivals.block_high[action, k, block], at)
 
 
-@inlined
-def write_numbers(instances, action, slot, numbers):
-    """Write what is fitted of an instance: effect and reward, and whether it ended an episode if there is room for that."""
-    d = len(instances.periodic)
-    for k in range(d):
-        numbers[k] = instances.effect[action, slot, k]
-    numbers[d] = instances.reward[action, slot]
-    if len(numbers) > d + 1:
-        numbers[d + 1] = instances.terminated[action, slot]
-
-
 @entry_point
 def put_arrivals(instances, arrivals):
     """Write where all instances lead."""
@@ -84,7 +73,12 @@ def put_transition(instances, arrivals, transition, effect, measured):
     for k in range(len(effect)):
         instances.effect[action, slot, k] = effect[k]
     put_arrival(instances, arrivals, action, slot)
-    write_numbers(instances, action, slot, numbers)
+    d = len(instances.periodic)
+    for k in range(d):
+        numbers[k] = instances.effect[action, slot, k]
+    numbers[d] = instances.reward[action, slot]
+    if len(numbers) > d + 1:
+        numbers[d + 1] = instances.terminated[action, slot]
     for v in range(len(numbers)):
         sums[action, v] += abs(numbers[v])
         size[v] = max(sums[action, v] / instances.size[action], least[v])

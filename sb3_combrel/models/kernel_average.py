@@ -159,8 +159,8 @@ class KernelAverage(GridModel):
 
     def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
         mdp, planned = self.mdp, (self.mdp.gamma, self._rules[1], self.n_added)
-        model = self._plain_experience[0], self._plain_pairs, mdp.plain, self.grid.plain, self._weights
-        return int(update_rows.call(*model, planned, pairs, transferred, mdp.plain_scratch, self._near))
+        model = self._plain_experience[0], self._plain_pairs, tuple(mdp.arrays), self.grid.plain, self._weights
+        return int(update_rows.call(*model, planned, pairs, transferred, tuple(mdp.scratch), self._near))
 
     def _predict_own(self, state: np.ndarray) -> float:
         given = state, self._weights, self.exploration_threshold, self._near, self._plain_prediction

@@ -58,13 +58,11 @@ class LinearScratch(NamedTuple):
 
 
 @compiled
-def distances_around(at, action, length, experience, fit):
+def distances_around(at, action, experience, fit):
     """How far ``at`` is from the nearest end, and from where the instance nearest to it has led."""
     _, arrivals, ends = experience
-    near = np.inf
-    if length > 0:
-        near = np.sqrt(squared_distance(at, arrivals.state[action, fit.item[0]], arrivals.periodic, True))
-    return np.sqrt(squared_distance_of_end(at, ends, arrivals.periodic)), near
+    near = squared_distance(at, arrivals.state[action, fit.item[0]], arrivals.periodic, True)
+    return np.sqrt(squared_distance_of_end(at, ends, arrivals.periodic)), np.sqrt(near)
 
 
 @compiled
@@ -108,27 +106,25 @@ def predict_own(experience, linear, prior, state, kernel, threshold, fit, scratc
         length = nearest_instances(instances, action, state, farthest, fit.item, fit.distance)
         linear.radius[action] = np.sqrt(fit.distance[length - 1]) if length == kernel.n_neighbors else np.inf
         weight = known_weight(fit, length, kernel)
-        if length > 0:
-            fit_around(state, action, length, instances, kernel, fit)
-            join_prior(prior[action], kernel, length, fit)
-        else:
-            fit.solution[:], fit.low[:], fit.high[:] = 0.0, 0.0, 0.0
+        prediction.weight[action], prediction.modelled[action] = weight, weight >= threshold
+        least = min(least, weight)
+        prediction.reward[action], prediction.length[action] = 0.0, 0
+        if length == 0:
+            continue
+        fit_around(state, action, length, instances, kernel, fit)
+        join_prior(prior[action], kernel, length, fit)
         scratch.away[:] = 0.0
         moved = 0.0
         for v in range(d):
-            effect = number_at(fit, v, scratch.away) if length > 0 else prior[action, v]
+            effect = number_at(fit, v, scratch.away)
             prediction.effect[action, 0, v] = effect
             scratch.to[v] = state[v] + effect
             moved += effect * effect
-        around = distances_around(state, action, length, experience, fit)
+        around = distances_around(state, action, experience, fit)
         reward = outcome_of(fit, scratch.away, scratch.to, np.sqrt(moved), around, experience, kernel, scratch.end)
         end = scratch.end[0]
-        prediction.reward[action] = reward
-        prediction.length[action] = 1 if end < 1.0 and length > 0 else 0
+        prediction.reward[action], prediction.length[action] = reward, 1 if end < 1.0 else 0
         prediction.probability[action, 0] = 1.0 - end
-        prediction.weight[action] = weight
-        prediction.modelled[action] = weight >= threshold
-        least = min(least, weight)
     return least
 
 
@@ -171,7 +167,7 @@ def take_step(fit, grid, at, scratch):
 
 
 @inlined
-def follow(action, length, experience, kernel, fit, grid, at, planned, scratch):
+def follow(action, experience, kernel, fit, grid, at, planned, scratch):
     """Follow a fit around a grid point, the action held, until a variable has changed by a cell, or the episode ends.
 
     :param at: grid coordinates of the point; ``planned``: (gamma, most steps)
@@ -182,7 +178,7 @@ def follow(action, length, experience, kernel, fit, grid, at, planned, scratch):
     away = scratch.away
     away[:] = 0.0
     total, goes_on, discount = 0.0, 1.0, 1.0
-    around = distances_around(scratch.at, action, length, experience, fit)
+    around = distances_around(scratch.at, action, experience, fit)
     for n in range(max_steps):
         inside = take_step(fit, grid, at, scratch)
         moved = 0.0
@@ -280,7 +276,7 @@ def update_rows(experience, linear, pairs, mdp, grid, kernel, planned, which, tr
                     for v in range(pairs.fit.shape[2]):
                         pairs.fit[pair, p, v] = fit.solution[p, v]
                 how = gamma, 1 if joined else MAX_MODEL_STEPS
-                reward, goes_on, discount = follow(action, length, experience, kernel, fit, grid, row_scratch.at, how, scratch)
+                reward, goes_on, discount = follow(action, experience, kernel, fit, grid, row_scratch.at, how, scratch)
                 if goes_on < 1.0:
                     # Near an end every arrival matters.
                     pairs.surprise[pair] = np.inf

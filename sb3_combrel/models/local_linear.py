@@ -91,9 +91,9 @@ class LocalLinear(GridModel):
     def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
         mdp = self.mdp
         planned = mdp.gamma, self._rules[1], self._has_prior, self.n_added
-        model = self._plain_experience, self._plain_linear, self._plain_pairs, mdp.plain, self.grid.plain, self._plain_kernel
-        scratch = mdp.plain_scratch, self._fit, self._scratch
-        return int(update_rows.call(*model, planned, pairs, transferred, *scratch))
+        model = self._plain_experience, self._plain_linear, self._plain_pairs, tuple(mdp.arrays), self.grid.plain
+        scratch = tuple(mdp.scratch), self._fit, self._scratch
+        return int(update_rows.call(*model, self._plain_kernel, planned, pairs, transferred, *scratch))
 
     def predict_alone(self, state: np.ndarray, action: int) -> tuple[np.ndarray, float]:
         found = np.zeros(self.grid.n_variables)

@@ -4,7 +4,7 @@ A model writes it pair by pair, the planner reads it. State-action pair ``action
 grid point ``point``. A pair without a model is optimistic: its value is the planner's upper bound, and it has no successors.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -56,7 +56,7 @@ class FiniteMDP:
         self.grid = grid
         self.n_actions = n_actions
         self.gamma = float(gamma)
-        #: The MDP for compiled code; ``plain``: the same as a plain tuple (see ``common.compiled``).
+        #: The MDP for compiled code, which takes it as a plain tuple where it is called often (see ``common.compiled``).
         self.arrays = MDPArrays(
             to=np.zeros((n_points, n_actions, width), dtype=np.uint16 if n_points <= 2**16 else np.int32),
             weight=np.zeros((n_points, n_actions, width)),
@@ -67,7 +67,6 @@ class FiniteMDP:
             span=np.zeros(d, dtype=np.int64),
             changed=np.ones(n_points, dtype=np.bool_),
         )
-        self.plain: tuple[Any, ...] = tuple(self.arrays)
         self.scratch = RowScratch(
             at=np.empty(d, dtype=np.int64),
             position=np.empty(d),
@@ -77,13 +76,11 @@ class FiniteMDP:
             touched=np.empty(n_points, dtype=np.int64),
             span=self.arrays.span,
         )
-        self.plain_scratch = tuple(self.scratch)
 
     def make_room(self) -> None:
         """Make rows twice as wide: a mean of many successors needs more room than one successor."""
         to, weight = (np.concatenate([array, np.zeros_like(array)], axis=2) for array in self.arrays[:2])
         self.arrays = self.arrays._replace(to=to, weight=weight)
-        self.plain = tuple(self.arrays)
 
     def write_rows(
         self, pairs: np.ndarray, modelled: np.ndarray, probability: np.ndarray, effect: np.ndarray, reward: np.ndarray

@@ -69,7 +69,7 @@ def mark_around(point, span, grid, marks, scratch):
 
 
 @entry_point
-def sweep_changes(values, mdp, upper, worth, lowest, searching, downwards, tolerance, told, changed, span, grid, scratch):
+def sweep_changes(values, mdp, upper, worth, lowest, searching, tolerance, told, changed, span, grid, scratch, downwards):
     """Back up the grid points on which changes of rows and values bear; the largest change. See :func:`backed_up`.
 
     A value that has changed by more than ``tolerance`` bears on the points from which a pair may lead there. When as many have
@@ -130,32 +130,27 @@ class Planner:
     def sweep(self, max_sweeps: int) -> int:
         """Back up the points, up and down the grid in turn, until little changes; the sweeps that this took."""
         lowest, searching = rules = self.bounds[0], self.worth is not self.upper
-        given = self.values, self._rows, self.upper, self.worth, lowest, searching
+        *rows, span, changed = self.mdp.arrays
+        given = self.values, tuple(rows), self.upper, self.worth, lowest, searching
         if not self.follows_changes:
-            return self._repeat(sweep, given, (), max_sweeps)
-        span, changed = self.mdp.arrays.span, self.mdp.arrays.changed
+            return self._repeat(sweep, given, max_sweeps)
         if rules != self._rules:
             self._rules = rules
             changed[:] = True
         more = self.tolerance, self._told, changed, span, self.mdp.grid.plain, self._scratch
-        return self._repeat(sweep_changes, given, more, max_sweeps)
+        return self._repeat(sweep_changes, given + more, max_sweeps)
 
     def cautious_values(self, max_sweeps: int) -> np.ndarray:
         """Values at the grid points without optimism, from below: of ways that exist, however few sweeps there are."""
         values = np.full(len(self.values), self.bounds[0])
         # What nobody has seen is worth the least there is.
-        self._repeat(sweep, (values, self._rows, self.upper, values.copy(), self.bounds[0], False), (), max_sweeps)
+        self._repeat(sweep, (values, self.mdp.arrays[:-2], self.upper, values.copy(), self.bounds[0], False), max_sweeps)
         return values
 
-    @property
-    def _rows(self) -> tuple[np.ndarray, ...]:
-        """What :func:`backed_up` needs of the finite MDP."""
-        return self.mdp.plain[:-2]
-
-    def _repeat(self, sweep_once: EntryPoint, given: tuple[Any, ...], more: tuple[Any, ...], max_sweeps: int) -> int:
+    def _repeat(self, sweep_once: EntryPoint, given: tuple[Any, ...], max_sweeps: int) -> int:
         """Sweep until little changes, up and down in turn; how often."""
         for n in range(max_sweeps):
-            if sweep_once.call(*given, n % 2 == 1, *more) <= self.tolerance:
+            if sweep_once.call(*given, n % 2 == 1) <= self.tolerance:
                 return n + 1
         return max_sweeps
 
