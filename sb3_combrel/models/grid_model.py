@@ -70,7 +70,7 @@ def join_transferred(transferred, threshold, prediction):
 
 
 class GridModel(Model):
-    """A model whose loops are compiled. Plain tuples for them are made once, not at every step (see ``common.compiled``)."""
+    """A model whose loops are compiled; they take plain tuples (see ``common.compiled``)."""
 
     #: Successors of an action that the own instances may predict.
     _own_room = 1
@@ -88,7 +88,6 @@ class GridModel(Model):
         )
         self.pairs = PairArrays.empty(len(self.known), self.kernel.reach, self._fitted, self._has_prior)
         self.own_weight, self.known = self.pairs.weight, self.pairs.known
-        self._plain_pairs, self._plain_kernel = tuple(self.pairs), tuple(self.kernel)
         # Where instances are transferred, what is not known is updated when its instances are twice as many.
         few = 0 if self._giver is None else 1
         self._rules = self.kernel.scale, self.exploration_threshold, few
@@ -102,7 +101,7 @@ class GridModel(Model):
         self._measured = np.zeros((self.n_actions, n)), least_size, np.zeros(n), np.zeros(n)
         self._cell = self.grid.diagonal
         self._points = tuple(PointScratch.empty(self.grid.arrays, len(self.known), n))
-        self._make_prediction(self._own_room)
+        self._prediction = Prediction.empty(self.n_actions, self._own_room, self.grid.n_variables)
         self._renew_arrivals()
 
     @property
@@ -122,10 +121,6 @@ class GridModel(Model):
     @abstractmethod
     def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
         """Fit, and write the rows of, (pairs, how many are done); how many are done then, fewer if there is no room."""
-
-    def _make_prediction(self, room: int) -> None:
-        self._prediction = Prediction.empty(self.n_actions, room, self.grid.n_variables)
-        self._plain_prediction = tuple(self._prediction)
 
     def _renew_arrivals(self) -> None:
         """Make the arrivals, which share arrays with the instances, and those among them that ended an episode."""
@@ -179,7 +174,7 @@ class GridModel(Model):
     def _note(self, instance: tuple[np.ndarray, ...], action: int, widest: float, why: int) -> np.ndarray:
         """Note at the pairs of an action what has happened near them; those that are to be fitted."""
         first = action * self.grid.n_points
-        n = note_instance.call(instance, first, self._plain_pairs, widest, why, self.grid.plain, self._rules, self._points)
+        n = note_instance.call(instance, first, tuple(self.pairs), widest, why, self.grid.plain, self._rules, self._points)
         # The next transition writes to the same work space, and an interrupt may leave these pairs to be fitted after it.
         due: np.ndarray = self._points[2][:n].copy()
         return due
@@ -252,9 +247,9 @@ class GridModel(Model):
         given = self._giver.transferred(states, np.arange(self.n_actions), self._prediction.weight)
         room = self._own_room + given.weight.shape[1]
         if room > self._prediction.probability.shape[1]:
-            self._make_prediction(room)
+            self._prediction = Prediction.empty(self.n_actions, room, self.grid.n_variables)
             self._predict_own(state)
-        join_transferred.call(tuple(given), self.exploration_threshold, self._plain_prediction)
+        join_transferred.call(tuple(given), self.exploration_threshold, tuple(self._prediction))
         return self._prediction, given
 
     def predict(self, states: np.ndarray, actions: np.ndarray) -> Predictions:

@@ -159,9 +159,9 @@ class KernelAverage(GridModel):
 
     def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
         mdp, planned = self.mdp, (self.mdp.gamma, self._rules[1], self.n_added)
-        model = self._plain_experience[0], self._plain_pairs, tuple(mdp.arrays), self.grid.plain, self._weights
+        model = self._plain_experience[0], tuple(self.pairs), tuple(mdp.arrays), self.grid.plain, self._weights
         return int(update_rows.call(*model, planned, pairs, transferred, tuple(mdp.scratch), self._near))
 
     def _predict_own(self, state: np.ndarray) -> float:
-        given = state, self._weights, self.exploration_threshold, self._near, self._plain_prediction
+        given = state, self._weights, self.exploration_threshold, self._near, tuple(self._prediction)
         return float(predict_own.call(self._plain_experience[0], *given))

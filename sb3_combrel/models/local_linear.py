@@ -53,7 +53,6 @@ class LocalLinear(GridModel):
         self._prior = transfer if self._has_prior else None
         d, n_pairs, n_near = self.grid.n_variables, len(self.known), settings.n_neighbors
         self.linear = LinearArrays(np.zeros((n_pairs, 2 * d)), np.zeros(d), np.full(self.n_actions, np.inf))
-        self._plain_linear = tuple(self.linear)
         self._fit = tuple(LocalFit.empty(n_near, d, settings.ends_by_action))
         self._scratch = tuple(LinearScratch(*(np.empty(n) for n in (d, d, d, d, 2))))
         self._corners = np.empty(d), np.empty(2**d, dtype=np.int64), np.empty(2**d)
@@ -89,15 +88,14 @@ class LocalLinear(GridModel):
         return np.flatnonzero(self.known.reshape(self.n_actions, -1) & changed)
 
     def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
-        mdp = self.mdp
-        planned = mdp.gamma, self._rules[1], self._has_prior, self.n_added
-        model = self._plain_experience, self._plain_linear, self._plain_pairs, tuple(mdp.arrays), self.grid.plain
+        mdp, planned = self.mdp, (self.mdp.gamma, self._rules[1], self._has_prior, self.n_added)
+        model = self._plain_experience, tuple(self.linear), tuple(self.pairs), tuple(mdp.arrays), self.grid.plain
         scratch = tuple(mdp.scratch), self._fit, self._scratch
-        return int(update_rows.call(*model, self._plain_kernel, planned, pairs, transferred, *scratch))
+        return int(update_rows.call(*model, tuple(self.kernel), planned, pairs, transferred, *scratch))
 
     def predict_alone(self, state: np.ndarray, action: int) -> tuple[np.ndarray, float]:
         found = np.zeros(self.grid.n_variables)
-        given = self._plain_experience[0], self._plain_kernel, state, action
+        given = self._plain_experience[0], tuple(self.kernel), state, action
         return found, float(predict_alone.call(*given, self._fit, self._scratch, found))
 
     def predict(self, states: np.ndarray, actions: np.ndarray) -> Predictions:
@@ -126,6 +124,6 @@ class LocalLinear(GridModel):
         return fit.solution[1 : d + 1, :d].copy(), variance, leverage
 
     def _predict_own(self, state: np.ndarray) -> float:
-        model, prior = (self._plain_experience, self._plain_linear), self._prior_at(state)
-        given = state, self._plain_kernel, self.exploration_threshold, self._fit, self._scratch, self._plain_prediction
-        return float(predict_own.call(*model, prior, *given))
+        given = self._plain_experience, tuple(self.linear), self._prior_at(state), state, tuple(self.kernel)
+        scratch = self._fit, self._scratch, tuple(self._prediction)
+        return float(predict_own.call(*given, self.exploration_threshold, *scratch))
