@@ -161,6 +161,10 @@ class Model(ABC):
         """Make room for at least so many instances of each action."""
         self.instances = self.instances.enlarged(capacity)
         self._number = np.pad(self._number, ((0, 0), (0, self.instances.capacity - self._number.shape[1])))
+        self._take_in_arrays()
+
+    def _take_in_arrays(self) -> None:  # noqa: B027 - most have nothing to do
+        """Take in that the instances are in other arrays."""
 
     def update_rows(self, pairs: np.ndarray) -> None:
         """Bring the rows of at most ``MAX_PAIRS_AT_ONCE`` pairs up to date with the instances and with what is transferred."""
@@ -201,6 +205,7 @@ class Model(ABC):
 
     def _share_instances(self, other: Model) -> None:
         self.instances, self._number, self.n_added = other.instances, other._number, other.n_added
+        self._take_in_arrays()
 
     def predict_alone(self, state: np.ndarray, action: int) -> tuple[np.ndarray, float]:
         """Predict the effect of an action at a state without a prior.
@@ -235,6 +240,7 @@ class Model(ABC):
         self._number = np.zeros((self.n_actions, self.instances.capacity), dtype=np.int64)
         for action, own in enumerate(numbers):
             self._number[action, : len(own)] = own
+        self._take_in_arrays()
 
     def update_all(self, pairs: np.ndarray) -> None:
         """:meth:`update_rows` of any number of pairs."""

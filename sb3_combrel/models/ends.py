@@ -19,21 +19,10 @@ ROUNDING = 1e-7
 
 
 class Ends(NamedTuple):
-    """The arrivals that ended an episode."""
+    """The arrivals that ended an episode; none where episodes end by what is done."""
 
     state: np.ndarray  # float64, (n_ends, n_variables)
     hint: np.ndarray  # int64 scratch, (2,): action and slot of an arrival near the last state that was asked for
-
-    @classmethod
-    def none(cls, n_variables: int) -> "Ends":
-        """No end anywhere, where episodes end by what is done."""
-        return cls(np.empty((0, n_variables)), np.zeros(2, dtype=np.int64))
-
-    @classmethod
-    def of(cls, arrivals: Instances) -> "Ends":
-        """Those among some arrivals."""
-        ended = [arrivals.state[action, :n][arrivals.terminated[action, :n]] for action, n in enumerate(arrivals.size)]
-        return cls(np.concatenate(ended), np.zeros(2, dtype=np.int64))
 
 
 @inlined

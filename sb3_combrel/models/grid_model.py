@@ -79,6 +79,10 @@ class GridModel(Model):
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
         super().__init__(mdp, settings, transfer)
+        # A transfer method is the prior of the fits, or gives instances for pairs that are not known.
+        is_prior = self.takes_prior and transfer is not None and transfer.use == "prior"
+        self._prior: InstanceTransfer | None = transfer if is_prior else None
+        self._giver: InstanceTransfer | None = None if is_prior else transfer
         breadth = float(settings.model_breadth)
         self.kernel = Kernel(
             scale=-1.0 / breadth**2,
@@ -86,7 +90,7 @@ class GridModel(Model):
             n_neighbors=settings.n_neighbors,
             outcome_breadth=min(breadth, float(settings.outcome_breadth)) ** 2,
         )
-        self.pairs = PairArrays.empty(len(self.known), self.kernel.reach, self._fitted, self._has_prior)
+        self.pairs = PairArrays.empty(len(self.known), self.kernel.reach, self._fitted, is_prior)
         self.own_weight, self.known = self.pairs.weight, self.pairs.known
         # Where instances are transferred, what is not known is updated when its instances are twice as many.
         few = 0 if self._giver is None else 1
@@ -99,20 +103,9 @@ class GridModel(Model):
         # Of effects, rewards and ends: sums of sizes by action, the least mean sizes; the last instance's, and mean sizes.
         n = len(least_size)
         self._measured = np.zeros((self.n_actions, n)), least_size, np.zeros(n), np.zeros(n)
-        self._cell = self.grid.diagonal
         self._points = tuple(PointScratch.empty(self.grid.arrays, len(self.known), n))
         self._prediction = Prediction.empty(self.n_actions, self._own_room, self.grid.n_variables)
-        self._renew_arrivals()
-
-    @property
-    def _has_prior(self) -> bool:
-        """Whether a transfer method is the prior of the fits."""
-        return self.takes_prior and self.transfer is not None and self.transfer.use == "prior"
-
-    @property
-    def _giver(self) -> InstanceTransfer | None:
-        """Where instances come from for pairs that are not known; a transfer method that is a prior gives none."""
-        return None if self._has_prior else self.transfer
+        self._take_in_arrays()
 
     @abstractmethod
     def _predict_own(self, state: np.ndarray) -> float:
@@ -122,7 +115,7 @@ class GridModel(Model):
     def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
         """Fit, and write the rows of, (pairs, how many are done); how many are done then, fewer if there is no room."""
 
-    def _renew_arrivals(self) -> None:
+    def _take_in_arrays(self) -> None:
         """Make the arrivals, which share arrays with the instances, and those among them that ended an episode."""
         instances = self.instances
         arrivals = Instances.empty(self.n_actions, self.grid.n_variables, instances.capacity)
@@ -132,7 +125,10 @@ class GridModel(Model):
         self._renew_ends()
 
     def _renew_ends(self) -> None:
-        self.ends = Ends.none(self.grid.n_variables) if self.settings.ends_by_action else Ends.of(self.arrivals)
+        arrivals, ended = self.arrivals, [np.empty((0, self.grid.n_variables))]
+        if not self.settings.ends_by_action:
+            ended += [arrivals.state[a, :n][arrivals.terminated[a, :n]] for a, n in enumerate(arrivals.size)]
+        self.ends = Ends(np.concatenate(ended), np.zeros(2, dtype=np.int64))
         self._plain_experience = tuple(self.instances), tuple(self.arrivals), tuple(self.ends)
 
     def add(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> np.ndarray:
@@ -155,7 +151,7 @@ class GridModel(Model):
         self._renew_ends()
         # What is known of ends concerns all actions that may lead there.
         arrived, noted = self.arrivals.state[action, slot], [due]
-        widest = (self._cell + float(np.linalg.norm(self.instances.effect[action, slot]))) ** 2
+        widest = (self.grid.diagonal + float(np.linalg.norm(self.instances.effect[action, slot]))) ** 2
         noted += [self._note((arrived, *numbers_and_size), other, widest, ENDED) for other in range(self.n_actions)]
         return np.unique(np.concatenate(noted))
 
@@ -195,12 +191,8 @@ class GridModel(Model):
                 self._renew_ends()
             return slot, removed
         if size == instances.capacity:
-            self._make_room(2 * size)
+            self._make_room(size + 1)
         return size, NO_PAIRS
-
-    def _make_room(self, capacity: int) -> None:
-        super()._make_room(capacity)
-        self._renew_arrivals()
 
     def end_episode(self) -> np.ndarray:
         """The pairs with transferred instances that have new ones of their own."""
@@ -209,7 +201,6 @@ class GridModel(Model):
     def _share_instances(self, other: Model) -> None:
         assert isinstance(other, GridModel)
         super()._share_instances(other)
-        self._renew_arrivals()
         if other._informed:
             self._set_informed()
 
@@ -287,10 +278,6 @@ class GridModel(Model):
         self._fit_until(due, n_added + 1)
         self.n_added = n_added
         self._put_in_order(state["instances"])
-
-    def _put_in_order(self, rows: np.ndarray) -> None:
-        super()._put_in_order(rows)
-        self._renew_arrivals()
 
     def _fit_until(self, due: deque[tuple[int, np.ndarray]], number: int) -> None:
         """Fit the pairs that were last fitted before transition ``number`` came."""

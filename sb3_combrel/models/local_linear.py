@@ -50,7 +50,6 @@ class LocalLinear(GridModel):
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
         self._fitted = mdp.grid.n_variables + 1, mdp.grid.n_variables + 1 + settings.ends_by_action
         super().__init__(mdp, settings, transfer)
-        self._prior = transfer if self._has_prior else None
         d, n_pairs, n_near = self.grid.n_variables, len(self.known), settings.n_neighbors
         self.linear = LinearArrays(np.zeros((n_pairs, 2 * d)), np.zeros(d), np.full(self.n_actions, np.inf))
         self._fit = tuple(LocalFit.empty(n_near, d, settings.ends_by_action))
@@ -88,7 +87,7 @@ class LocalLinear(GridModel):
         return np.flatnonzero(self.known.reshape(self.n_actions, -1) & changed)
 
     def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
-        mdp, planned = self.mdp, (self.mdp.gamma, self._rules[1], self._has_prior, self.n_added)
+        mdp, planned = self.mdp, (self.mdp.gamma, self._rules[1], self._prior is not None, self.n_added)
         model = self._plain_experience, tuple(self.linear), tuple(self.pairs), tuple(mdp.arrays), self.grid.plain
         scratch = tuple(mdp.scratch), self._fit, self._scratch
         return int(update_rows.call(*model, tuple(self.kernel), planned, pairs, transferred, *scratch))

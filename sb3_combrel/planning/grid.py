@@ -259,8 +259,6 @@ class StateGrid:
         self.arrays = GridArrays(shape, strides, cells, outside, flags, lines, even)
         # The same as a plain tuple (see ``common.compiled``).
         self.plain = tuple(self.arrays)
-        self._corner_index = np.empty(2**n_variables, dtype=np.int64)
-        self._corner_weight = np.empty(2**n_variables)
 
     def points(self) -> np.ndarray:
         """All grid points, unit coordinates, shape (n_points, n_variables)."""
@@ -300,8 +298,8 @@ class StateGrid:
 
     def interpolate(self, values: np.ndarray, state: np.ndarray) -> float:
         """Multilinear interpolation of values at the grid points at a state; outside the grid its nearest point counts."""
-        position = self.coordinates(state[None])[0]
-        return interpolate(values, position, self.arrays, self._corner_index, self._corner_weight)
+        position, n_corners = self.coordinates(state[None])[0], 2**self.n_variables
+        return interpolate(values, position, self.arrays, np.empty(n_corners, dtype=np.int64), np.empty(n_corners))
 
     def cells_around(self, states: np.ndarray) -> np.ndarray:
         """The numbers of the corners of the cells that states are in, or of the nearest ones, shape (n, 2 ** n_variables)."""

@@ -93,20 +93,21 @@ def find_nearest(query, recorded, limits, near, distance):
 
 
 @compiled
-def choose_one(near, compliance, required, n_candidates, draw, total):
-    """Choose a candidate by the mean compliance of ``near``; -1 if none exceeds what is required (lines 19-20).
+def choose_one(near, action, cache, first, draw):
+    """Choose a candidate of ``action`` by the mean compliance of ``near``; -1 if none exceeds what is required (lines 19-20).
 
     :param draw: a random number from [0, 1): each candidate that exceeds what is required is chosen with a probability in
         proportion to its mean compliance; below 0: the one with the highest is (of equal ones the first)
     """
-    bar = 0.0
+    bar, total = 0.0, cache.total
+    n_candidates = first[action + 1] - first[action]
     total[:n_candidates] = 0.0
     for k in range(len(near)):
         i = near[k]
         if i >= 0:
-            bar += required[i]
+            bar += cache.required[i]
             for c in range(n_candidates):
-                total[c] += compliance[i, c]
+                total[c] += cache.compliance[i, c]
     best = -1
     highest = bar
     mass = 0.0
@@ -117,15 +118,15 @@ def choose_one(near, compliance, required, n_candidates, draw, total):
             highest = total[c]
             best = c
     if draw < 0.0 or best < 0:
-        return best
+        return first[action] + best if best >= 0 else best
     mass *= draw
     for c in range(n_candidates):
         if total[c] > bar:
             mass -= total[c]
             # Rounding may leave a little to the end.
             if mass < 0.0:
-                return c
-    return best
+                return first[action] + c
+    return first[action] + best
 
 
 @compiled
@@ -150,17 +151,14 @@ def choose(rows, actions, near, cache, first, draws, choice):
     cache = ComplianceCache(*cache)
     n_changed = 0
     last = np.int64(-1)
-    best = np.int64(-1)
+    chosen = np.int64(-1)
     for k in range(len(rows)):
         row = rows[k]
-        action = actions[k]
         draw = draws[k] if len(draws) > 0 else -1.0
         # Most states have the same nearest transitions as the state before, and their choice follows from these alone.
-        if last < 0 or draw >= 0.0 or not same_neighbors(near[row], near[last]):
-            n_candidates = first[action + 1] - first[action]
-            best = choose_one(near[row], cache.compliance, cache.required, n_candidates, draw, cache.total)
+        if last < 0 or draw >= 0.0 or actions[k] != actions[k - 1] or not same_neighbors(near[row], near[last]):
+            chosen = choose_one(near[row], actions[k], cache, first, draw)
         last = row
-        chosen = best + first[action] if best >= 0 else best
         if chosen != choice[row]:
             choice[row] = chosen
             rows[n_changed] = row
@@ -186,10 +184,7 @@ def select(query, recorded, limits, cache, first, draws, found):
             if near[r, k] >= 0 and not cache.measured[near[r, k]]:
                 return False
     for r in range(len(actions)):
-        action = actions[r]
-        draw = draws[action] if len(draws) > 0 else -1.0
-        n_candidates = first[action + 1] - first[action]
-        chosen = choose_one(near[r], cache.compliance, cache.required, n_candidates, draw, cache.total)
-        begin[r] = chosen + first[action] if chosen >= 0 else 0
-        end[r] = begin[r] + 1 if chosen >= 0 else 0
+        draw = draws[actions[r]] if len(draws) > 0 else -1.0
+        chosen = choose_one(near[r], actions[r], cache, first, draw)
+        begin[r], end[r] = max(chosen, 0), chosen + 1
     return True
