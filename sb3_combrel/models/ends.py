@@ -84,13 +84,6 @@ def squared_distance_of_end(state, ends, periodic):
 
 
 @inlined
-def far_from_ends(moved, of_end, near, outcome_breadth):
-    """Whether no end decides at a place, so far from a point that has an end so far away, and some arrival so near."""
-    apart = of_end - moved
-    return apart > 0.0 and apart * apart - (moved + near) ** 2 > NEGLIGIBLE * outcome_breadth
-
-
-@inlined
 def reach_of(nearest, outcome_breadth):
     """How far arrivals decide, if the nearest is so far; all squared."""
     return nearest + NEGLIGIBLE * min(outcome_breadth, nearest + ROUNDING)

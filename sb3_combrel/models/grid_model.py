@@ -103,7 +103,9 @@ class GridModel(Model):
         # Of effects, rewards and ends: sums of sizes by action, the least mean sizes; the last instance's, and mean sizes.
         n = len(least_size)
         self._measured = np.zeros((self.n_actions, n)), least_size, np.zeros(n), np.zeros(n)
-        self._points = tuple(PointScratch.empty(self.grid.arrays, len(self.known), n))
+        along = np.empty((self.grid.n_variables, int(self.grid.arrays.shape.max())))
+        span, due = np.empty((3, self.grid.n_variables), dtype=np.int64), np.empty(len(self.known), dtype=np.int64)
+        self._points = tuple(PointScratch(along, span, due, predicted=np.empty(n)))
         self._prediction = Prediction.empty(self.n_actions, self._own_room, self.grid.n_variables)
         self._take_in_arrays()
 

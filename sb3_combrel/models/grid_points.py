@@ -56,13 +56,6 @@ class PointScratch(NamedTuple):
     pair: np.ndarray  # int64, (n_pairs,): pairs that are due
     predicted: np.ndarray  # float64, (n_numbers,): what a pair predicts
 
-    @classmethod
-    def empty(cls, grid: GridArrays, n_pairs: int, n_numbers: int) -> "PointScratch":
-        """Make room for a grid."""
-        d = len(grid.shape)
-        along = np.empty((d, int(grid.shape.max())))
-        return cls(along, np.empty((3, d), dtype=np.int64), np.empty(n_pairs, dtype=np.int64), np.empty(n_numbers))
-
 
 @inlined
 def note_fit(pair, length, weight, threshold, transitions, pairs):

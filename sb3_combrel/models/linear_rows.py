@@ -19,7 +19,7 @@ from sb3_combrel.common.regression import (
     number_at,
 )
 from sb3_combrel.common.transferred import TransferredInstances
-from sb3_combrel.models.ends import Ends, end_at, far_from_ends, squared_distance_of_end
+from sb3_combrel.models.ends import Ends, end_at, reach_of, squared_distance_of_end
 from sb3_combrel.models.grid_model import add_to_row, total_weight
 from sb3_combrel.models.grid_points import PairArrays, note_fit
 from sb3_combrel.planning.grid import (
@@ -55,6 +55,7 @@ class LinearScratch(NamedTuple):
     step: np.ndarray  # (n_variables,): the effect of a step
     to: np.ndarray  # (n_variables,): where it leads
     end: np.ndarray  # (2,): probability of an end there, and what it pays
+    prior: np.ndarray  # (2 * n_variables,): what a prior says at a state, between the grid points multilinear
 
 
 @compiled
@@ -79,24 +80,31 @@ def outcome_of(fit, away, to, moved, around, experience, kernel, end):
     _, arrivals, ends = experience
     of_end, near = around
     end[0], end[1] = 0.0, 0.0
-    if not far_from_ends(moved, of_end, near, kernel.outcome_breadth):
-        end_at(to, (moved + near) ** 2, kernel.outcome_breadth, arrivals, ends, end)
+    # Where even the nearest end there could be is too far to decide, none is searched for.
+    apart, arrived = max(of_end - moved, 0.0), (moved + near) ** 2
+    if apart * apart <= reach_of(arrived, kernel.outcome_breadth):
+        end_at(to, arrived, kernel.outcome_breadth, arrivals, ends, end)
     return (1.0 - end[0]) * reward + end[0] * end[1]
 
 
 @entry_point
-def predict_own(experience, linear, prior, state, kernel, threshold, fit, scratch, prediction):
+def predict_own(experience, linear, grid, has_prior, state, kernel, threshold, fit, scratch, corners, prediction):
     """Predict every action at ``state`` from the instances nearest to it, and from the prior; the least weight one has.
 
     :param experience: (instances, arrivals, ends); plain tuples all of them
-    :param prior: what it predicts at ``state``, float64, shape (n_actions, 2 * n_variables), see ``LinearArrays``
+    :param corners: work space: position, corner_index, corner_weight (see ``corners_of``)
     """
     instances = Instances(*experience[0])
     experience = instances, Instances(*experience[1]), Ends(*experience[2])
     linear, kernel, fit = LinearArrays(*linear), Kernel(*kernel), LocalFit(*fit)
-    scratch, prediction = LinearScratch(*scratch), Prediction(*prediction)
+    scratch, prediction, grid = LinearScratch(*scratch), Prediction(*prediction), GridArrays(*grid)
+    position, corner, corner_weight = corners
     d = len(state)
     least = np.inf
+    n_corners = 0
+    if has_prior:
+        grid_coordinates(state, grid, position)
+        n_corners = corners_of(position, grid, corner, corner_weight)
     apart = np.sqrt(squared_distance(state, linear.last, instances.periodic, True))
     for v in range(d):
         linear.last[v] = state[v]
@@ -112,7 +120,14 @@ def predict_own(experience, linear, prior, state, kernel, threshold, fit, scratc
         if length == 0:
             continue
         fit_around(state, action, length, instances, kernel, fit)
-        join_prior(prior[action], kernel, length, fit)
+        if has_prior:
+            # Finer effects would be confirmed by instances at a wall, but not at the grid points beside, which lead through.
+            first = action * grid.shape[0] * grid.strides[0]
+            scratch.prior[:] = 0.0
+            for c in range(n_corners):
+                for k in range(2 * d):
+                    scratch.prior[k] += corner_weight[c] * linear.prior[first + corner[c], k]
+            join_prior(scratch.prior, kernel, length, fit)
         scratch.away[:] = 0.0
         moved = 0.0
         for v in range(d):
@@ -290,21 +305,3 @@ def update_rows(experience, linear, pairs, mdp, grid, kernel, planned, which, tr
         set_modelled(mdp, pair, known or joined)
         done += 1
     return done
-
-
-@entry_point
-def interpolate_prior(prior, grid, state, corners, found):
-    """Write what a prior says of all actions at ``state``, multilinear between the grid points, to ``found``.
-
-    :param prior: as in ``LinearArrays``; ``corners``: work space: position, corner_index, corner_weight (see ``corners_of``)
-    :param found: float64, shape (n_actions, 2 * n_variables)
-    """
-    grid = GridArrays(*grid)
-    position, corner, weight = corners
-    n_points = grid.shape[0] * grid.strides[0]
-    grid_coordinates(state, grid, position)
-    found[:] = 0.0
-    for c in range(corners_of(position, grid, corner, weight)):
-        for action in range(len(found)):
-            for k in range(found.shape[1]):
-                found[action, k] += weight[c] * prior[action * n_points + corner[c], k]

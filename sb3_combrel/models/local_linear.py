@@ -13,7 +13,6 @@ from sb3_combrel.models.grid_model import GridModel
 from sb3_combrel.models.linear_rows import (
     LinearArrays,
     LinearScratch,
-    interpolate_prior,
     predict_alone,
     predict_own,
     update_rows,
@@ -53,7 +52,7 @@ class LocalLinear(GridModel):
         d, n_pairs, n_near = self.grid.n_variables, len(self.known), settings.n_neighbors
         self.linear = LinearArrays(np.zeros((n_pairs, 2 * d)), np.zeros(d), np.full(self.n_actions, np.inf))
         self._fit = tuple(LocalFit.empty(n_near, d, settings.ends_by_action))
-        self._scratch = tuple(LinearScratch(*(np.empty(n) for n in (d, d, d, d, 2))))
+        self._scratch = tuple(LinearScratch(*(np.empty(n) for n in (d, d, d, d, 2, 2 * d))))
         self._corners = np.empty(d), np.empty(2**d, dtype=np.int64), np.empty(2**d)
         self._prior_version = -1
 
@@ -62,16 +61,6 @@ class LocalLinear(GridModel):
         if slot < self.instances.size[action]:
             self.linear.radius[action] = np.inf
         return slot, removed
-
-    def _prior_at(self, state: np.ndarray) -> np.ndarray:
-        """What the prior says of all actions at a state, between the grid points multilinear: as in ``LinearArrays``.
-
-        Finer effects would be confirmed by instances at a wall, but not at the grid points beside, which lead through it.
-        """
-        found = np.zeros((self.n_actions, 2 * self.grid.n_variables))
-        if self._prior is not None:
-            interpolate_prior.call(self.linear.prior, self.grid.plain, state, self._corners, found)
-        return found
 
     def renew_prior(self) -> np.ndarray:
         if self._prior is None or self._prior.prior_version() == self._prior_version:
@@ -123,6 +112,7 @@ class LocalLinear(GridModel):
         return fit.solution[1 : d + 1, :d].copy(), variance, leverage
 
     def _predict_own(self, state: np.ndarray) -> float:
-        given = self._plain_experience, tuple(self.linear), self._prior_at(state), state, tuple(self.kernel)
-        scratch = self._fit, self._scratch, tuple(self._prediction)
-        return float(predict_own.call(*given, self.exploration_threshold, *scratch))
+        model = self._plain_experience, tuple(self.linear), self.grid.plain, self._prior is not None
+        scratch = self._fit, self._scratch, self._corners
+        given = *model, state, tuple(self.kernel), self.exploration_threshold, *scratch, tuple(self._prediction)
+        return float(predict_own.call(*given))

@@ -96,25 +96,12 @@ def _exponentiate(row, n):
     for j in range(n):
         x = row[j]
         y = (x if x < FARTHEST else FARTHEST) * (-1.0 / 64.0)
-        value = 1.0 + y * (1.0 / 13.0)
-        value = 1.0 + y * (1.0 / 12.0) * value
-        value = 1.0 + y * (1.0 / 11.0) * value
-        value = 1.0 + y * (1.0 / 10.0) * value
-        value = 1.0 + y * (1.0 / 9.0) * value
-        value = 1.0 + y * (1.0 / 8.0) * value
-        value = 1.0 + y * (1.0 / 7.0) * value
-        value = 1.0 + y * (1.0 / 6.0) * value
-        value = 1.0 + y * (1.0 / 5.0) * value
-        value = 1.0 + y * (1.0 / 4.0) * value
-        value = 1.0 + y * (1.0 / 3.0) * value
-        value = 1.0 + y * (1.0 / 2.0) * value
-        value = 1.0 + y * value
-        value *= value
-        value *= value
-        value *= value
-        value *= value
-        value *= value
-        row[j] = value * value
+        value = 1.0
+        for k in range(13):
+            value = 1.0 + y * (1.0 / (13 - k)) * value
+        for _ in range(6):
+            value *= value
+        row[j] = value
 
 
 @compiled_fast

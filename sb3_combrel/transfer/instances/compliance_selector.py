@@ -183,17 +183,13 @@ class ComplianceSelector(Selector):
         if len(pairs) > MAX_COMPARED:
             pairs = pairs[(np.arange(MAX_COMPARED) * (len(pairs) / MAX_COMPARED)).astype(np.int64)]
         self._measure(self._near[pairs])
-        n_candidates = int(self.first[action + 1] - self.first[action])
-        compared = np.empty((len(pairs), 3))
-        for row, pair in enumerate(pairs.tolist()):
-            near = self._near[pair]
+        n_candidates, compared = int(self.first[action + 1] - self.first[action]), []
+        for near, candidate in zip(self._near[pairs], self._choice[pairs].tolist(), strict=True):
             near = near[near >= 0]
-            mean = self._cache.compliance[near, :n_candidates].mean(axis=0)
-            chosen = int(self._choice[pair] - self.first[action])
-            others = np.delete(mean, chosen)
+            mean, chosen = self._cache.compliance[near, :n_candidates].mean(axis=0), candidate - self.first[action]
             no_change = np.mean([self._table.no_change(self.transitions, i) for i in near.tolist()])
-            compared[row] = mean[chosen], others.max(initial=-np.inf), no_change
-        chosen_mean, next_best, no_change = compared.mean(axis=0).tolist()
+            compared.append((mean[chosen], np.delete(mean, chosen).max(initial=-np.inf), no_change))
+        chosen_mean, next_best, no_change = np.array(compared).mean(axis=0).tolist()
         return Confidence(chosen_mean, next_best if n_candidates > 1 else np.nan, no_change)
 
     def get_state(self) -> dict[str, np.ndarray]:

@@ -25,19 +25,17 @@ def renew_relevance(
     """
     weight, evidence = np.empty(n_used), np.empty(values.shape[1])
     periodic = np.array(candidates.task.periodic)
-    of_actions = {}
-    for a in range(len(candidates.arrays.first) - 1):
-        rows = np.flatnonzero(transitions.actions[:n_used] == a)
-        of_actions[a] = transitions.states[rows], transitions.effects[rows], transitions.rewards[rows]
+    rows = [np.flatnonzero(transitions.actions[:n_used] == a) for a in range(candidates.task.n_actions)]
+    of_actions = [(transitions.states[some], transitions.effects[some], transitions.rewards[some]) for some in rows]
     for c, origin in enumerate(candidates.origins):
         row = candidates.arrays.row[c]
         mapping = candidates.table.variable[row], candidates.table.sign[row], periodic
         of_row = bandwidths.of_all._replace(start=float(bandwidths.starts[row]))
-        target, source_action = of_actions[origin.target_action], candidates.arrays.action[c]
+        given = of_actions[origin.target_action], candidates.instances, candidates.arrays.action[c], mapping, of_row
         if mu is None:
-            near_relevance.call(target, candidates.instances, source_action, mapping, of_row, weight, evidence, values[c])
+            near_relevance.call(*given, weight, evidence, values[c])
         else:
-            relevance.call(target, candidates.instances, source_action, mapping, of_row, mu, weight, values[c])
+            relevance.call(*given, mu, weight, values[c])
 
 
 @entry_point

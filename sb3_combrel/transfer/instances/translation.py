@@ -45,18 +45,6 @@ class TranslationScratch(NamedTuple):
     full: np.ndarray  # bool, shape (1,): an instance that was needed did not fit
     enters: np.ndarray  # float64, shape (1,): an instance of no higher rank than this is not needed
 
-    @classmethod
-    def empty(cls, room: int, n_variables: int) -> TranslationScratch:
-        return cls(
-            number=np.empty((room, 2), dtype=np.int64),
-            value=np.empty((room, 2)),
-            variable=np.empty(n_variables, dtype=np.int64),
-            at=np.empty(n_variables),
-            periodic=np.zeros(n_variables, dtype=np.bool_),
-            full=np.zeros(1, dtype=np.bool_),
-            enters=np.zeros(1),
-        )
-
 
 class TranslationArrays(NamedTuple):
     """All that the translator's loops read, and their work space."""
@@ -260,7 +248,15 @@ class Translator:
     def _make_room(self, n: int, max_instances: int) -> None:
         """Make room for so many instances of each of ``n`` states and actions."""
         n_variables = len(self._periodic)
-        self._scratch = TranslationScratch.empty(max_instances + 1, n_variables)
+        self._scratch = TranslationScratch(
+            number=np.empty((max_instances + 1, 2), dtype=np.int64),
+            value=np.empty((max_instances + 1, 2)),
+            variable=np.empty(n_variables, dtype=np.int64),
+            at=np.empty(n_variables),
+            periodic=np.zeros(n_variables, dtype=np.bool_),
+            full=np.zeros(1, dtype=np.bool_),
+            enters=np.zeros(1),
+        )
         self._transferred = TransferredInstances.empty(n, n_variables, max_instances)
 
     def set_breadth(self, breadth: float) -> None:
