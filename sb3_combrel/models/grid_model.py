@@ -7,7 +7,6 @@ depends on the transitions alone: so a model is saved as its transitions and one
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections import deque
 from typing import Any
 
 import numpy as np
@@ -92,11 +91,8 @@ class GridModel(Model):
         )
         self.pairs = PairArrays.empty(len(self.known), self.kernel.reach, self._fitted, is_prior)
         self.own_weight, self.known = self.pairs.weight, self.pairs.known
-        # Where instances are transferred, what is not known is updated when its instances are twice as many.
-        few = 0 if self._giver is None else 1
-        self._rules = self.kernel.scale, self.exploration_threshold, few
-        # Whether an outcome has told states apart.
-        self._informed, self._first_reward, self._informed_at = not self.searches, np.nan, 0
+        # The transition whose outcome was the first to tell states apart; 0: none has.
+        self._first_reward, self._informed_at = np.nan, 0
         # A variable that hardly ever changes is measured by this part of a cell.
         least = [1e-9, 1e-9] if settings.ends_by_action else [1e-9]
         least_size = np.append(LEAST_SIZE / self.grid.arrays.cells, least)
@@ -108,6 +104,16 @@ class GridModel(Model):
         self._points = tuple(PointScratch(along, span, due, predicted=np.empty(n)))
         self._prediction = Prediction.empty(self.n_actions, self._own_room, self.grid.n_variables)
         self._take_in_arrays()
+
+    @property
+    def _informed(self) -> bool:
+        """Whether an outcome has told states apart."""
+        return 0 < self._informed_at <= self.n_added
+
+    @property
+    def _threshold(self) -> float:
+        """The weight with which grid points are known."""
+        return ON_GRID * self.exploration_threshold if self._informed else self.exploration_threshold
 
     @abstractmethod
     def _predict_own(self, state: np.ndarray) -> float:
@@ -146,7 +152,7 @@ class GridModel(Model):
         self._number[action, slot] = self.n_added
         numbers_and_size = self._measured[2:]
         due = self._note((self.instances.state[action, slot], *numbers_and_size), action, self.kernel.reach, CAME)
-        if not self._informed:
+        if self.searches and not self._informed:
             due = self._inform(float(transition[4]), bool(terminated), due)
         if not terminated or self.settings.ends_by_action:
             return due
@@ -163,16 +169,14 @@ class GridModel(Model):
         if not (terminated or abs(reward - self._first_reward) > 1e-9 * abs(reward)):
             return due
         self._informed_at = self.n_added
-        self._set_informed()
-        return np.union1d(due, np.flatnonzero(~self.known & (self.own_weight >= self._rules[1])))
-
-    def _set_informed(self) -> None:
-        self._informed, self._rules = True, (self._rules[0], ON_GRID * self.exploration_threshold, self._rules[2])
+        return np.union1d(due, np.flatnonzero(~self.known & (self.own_weight >= self._threshold)))
 
     def _note(self, instance: tuple[np.ndarray, ...], action: int, widest: float, why: int) -> np.ndarray:
         """Note at the pairs of an action what has happened near them; those that are to be fitted."""
+        # Where instances are transferred, what is not known is updated when its instances are twice as many.
+        rules = self.kernel.scale, self._threshold, 0 if self._giver is None else 1
         first = action * self.grid.n_points
-        n = note_instance.call(instance, first, tuple(self.pairs), widest, why, self.grid.plain, self._rules, self._points)
+        n = note_instance.call(instance, first, tuple(self.pairs), widest, why, self.grid.plain, rules, self._points)
         # The next transition writes to the same work space, and an interrupt may leave these pairs to be fitted after it.
         due: np.ndarray = self._points[2][:n].copy()
         return due
@@ -203,8 +207,7 @@ class GridModel(Model):
     def _share_instances(self, other: Model) -> None:
         assert isinstance(other, GridModel)
         super()._share_instances(other)
-        if other._informed:
-            self._set_informed()
+        self._informed_at = other._informed_at
 
     def outdated(self) -> np.ndarray:
         return np.flatnonzero(self.pairs.n_new) if self._giver is None else super().outdated()
@@ -269,29 +272,21 @@ class GridModel(Model):
         self._make_room(int(np.bincount(actions, minlength=self.n_actions).max()))
         n_added, self._informed_at = (int(number) for number in state["n_added"])
         fitted_at = state["fitted_at"].astype(np.int64)
-        due = when_fitted(fitted_at)
         if self._giver is not None and len(rows) > 0:
             self.update_all(np.flatnonzero(fitted_at == 0))
-        for action, row in zip(actions.tolist(), rows, strict=True):
-            self._fit_until(due, int(row[-1]))
-            self.n_added = int(row[-1]) - 1
+        by_time = np.argsort(fitted_at, kind="stable")
+        times, first = np.unique(fitted_at[by_time], return_index=True)
+        fits = zip(times.tolist(), np.split(by_time, first[1:]), strict=True)
+        events: list[tuple[int, bool, Any]] = [(time, True, pairs) for time, pairs in fits if 0 < time <= n_added]
+        events += [(int(row[-1]), False, (action, row)) for action, row in zip(actions.tolist(), rows, strict=True)]
+        # A transition comes before the fits to it.
+        for number, is_fit, what in sorted(events, key=lambda event: event[:2]):
+            if is_fit:
+                self.n_added = number
+                self.update_all(what)
+                continue
+            self.n_added, (action, row) = number - 1, what
             at, effect = row[1 : 1 + d].copy(), row[1 + d : 1 + 2 * d].copy()
             self._put((action, int(self.instances.size[action]), at, at, float(row[-3]), bool(row[-2] > 0.5)), effect)
-        self._fit_until(due, n_added + 1)
         self.n_added = n_added
         self._put_in_order(state["instances"])
-
-    def _fit_until(self, due: deque[tuple[int, np.ndarray]], number: int) -> None:
-        """Fit the pairs that were last fitted before transition ``number`` came."""
-        while due and due[0][0] < number:
-            self.n_added, pairs = due.popleft()
-            if 0 < self._informed_at <= self.n_added:
-                self._set_informed()
-            self.update_all(pairs)
-
-
-def when_fitted(fitted_at: np.ndarray) -> deque[tuple[int, np.ndarray]]:
-    """The transitions at which pairs were last fitted, and these pairs, ascending; those that never were are left out."""
-    pairs = np.argsort(fitted_at, kind="stable")
-    times, first = np.unique(fitted_at[pairs], return_index=True)
-    return deque((time, some) for time, some in zip(times.tolist(), np.split(pairs, first[1:]), strict=True) if time > 0)

@@ -158,7 +158,7 @@ class KernelAverage(GridModel):
         self._near = tuple(NearList(np.zeros(room, dtype=np.int32), np.empty(room), np.empty(self.grid.n_variables)))
 
     def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
-        mdp, planned = self.mdp, (self.mdp.gamma, self._rules[1], self.n_added)
+        mdp, planned = self.mdp, (self.mdp.gamma, self._threshold, self.n_added)
         model = self._plain_experience[0], tuple(self.pairs), tuple(mdp.arrays), self.grid.plain, self._weights
         return int(update_rows.call(*model, planned, pairs, transferred, tuple(mdp.scratch), self._near))
 

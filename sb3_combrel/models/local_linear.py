@@ -76,7 +76,7 @@ class LocalLinear(GridModel):
         return np.flatnonzero(self.known.reshape(self.n_actions, -1) & changed)
 
     def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
-        mdp, planned = self.mdp, (self.mdp.gamma, self._rules[1], self._prior is not None, self.n_added)
+        mdp, planned = self.mdp, (self.mdp.gamma, self._threshold, self._prior is not None, self.n_added)
         model = self._plain_experience, tuple(self.linear), tuple(self.pairs), tuple(mdp.arrays), self.grid.plain
         scratch = tuple(mdp.scratch), self._fit, self._scratch
         return int(update_rows.call(*model, tuple(self.kernel), planned, pairs, transferred, *scratch))
