@@ -118,8 +118,6 @@ def end_at(state, near, outcome_breadth, arrivals, ends, found):
     :param outcome_breadth: squared
     """
     found[0], found[1] = 0.0, 0.0
-    if len(ends.state) == 0:
-        return
     of_end = squared_distance_of_end(state, ends, arrivals.periodic)
     if of_end > reach_of(near, outcome_breadth):
         return

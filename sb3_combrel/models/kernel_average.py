@@ -143,8 +143,6 @@ class KernelAverage(GridModel):
     do not count; of the others, nearest first, one counts while its weight is at least ``min_fraction`` of the sum of those
     before it. A nearer instance can so shorten the list of a known pair, which is a better model, not less knowledge: the
     pair stays known.
-
-    Parameters: see :class:`~sb3_combrel.models.base.Model`.
     """
 
     # Rows of dozens of successors take long to back up.

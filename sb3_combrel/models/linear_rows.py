@@ -248,9 +248,7 @@ def recall_own_fit(pair, at, action, instances, pairs, fit):
 def update_rows(experience, linear, pairs, mdp, grid, kernel, planned, which, transferred, row_scratch, fit, scratch):
     """Fit pairs anew, and write their rows, with transferred instances for what is not known; how many are done.
 
-    :param planned: (gamma, threshold, whether there is a prior, transitions so far); plain tuples for the rest
-    :param which: (pairs, how many of them are done)
-    :param transferred: a row for each of them, which counts only while the pair is not known
+    :param planned: (gamma, threshold, whether there is a prior, transitions so far); the rest as in ``kernel_average``
     """
     instances = Instances(*experience[0])
     experience = instances, Instances(*experience[1]), Ends(*experience[2])

@@ -40,8 +40,6 @@ class LocalLinear(GridModel):
     A prior (a transfer method with ``use="prior"``) counts as an instance at the very state, of the weight that it has there.
     Its effects and weights are those at the grid points, interpolated between them. What is known, rewards and ends are by the
     own instances alone.
-
-    Parameters: see :class:`~sb3_combrel.models.base.Model`.
     """
 
     takes_prior = searches = plans_finer = asks_what_ends = True

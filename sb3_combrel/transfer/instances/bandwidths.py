@@ -24,11 +24,10 @@ class CandidateBandwidths(NamedTuple):
 
 def candidate_bandwidths(candidates: Candidates, given: Sequence[float] | None) -> CandidateBandwidths:
     """Take the bandwidths ``given``, (start, outcome, reward), the same for all mappings; or choose them from the data."""
-    if given is not None:
-        of_all = Bandwidths(*given)
-        return CandidateBandwidths(of_all, np.full(len(candidates.table.variable), of_all.start))
-    of_all = default_bandwidths(candidates.instances)
-    return CandidateBandwidths(of_all, start_bandwidths(candidates, of_all.start))
+    if given is None:
+        of_all = default_bandwidths(candidates.instances)
+        return CandidateBandwidths(of_all, start_bandwidths(candidates, of_all.start))
+    return CandidateBandwidths(Bandwidths(*given), np.full(len(candidates.table.variable), float(given[0])))
 
 
 def default_bandwidths(source: Instances) -> Bandwidths:
