@@ -60,20 +60,14 @@ class Predictions(NamedTuple):
 class InstanceTransfer(Protocol):
     """What a model knows of a transfer method (see ``sb3_combrel.transfer.base.Transfer``); what it gives has been checked."""
 
-    #: "instances" or "prior": which of the methods below are called.
-    use: str
+    use: str  # "instances" or "prior": which of the other methods are called
 
-    def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
-        """Transferred instances for states, unit coordinates, and actions."""
-
-    def transferred_to_sample(self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances:
-        """The same for states of the finite sample, by number."""
-
-    def prior(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions:
-        """What the source predicts of states, unit coordinates, and actions; of its effects those at grid points are used."""
-
-    def prior_version(self) -> int:
-        """A number that grows when what ``prior`` returns may have changed."""
+    def transferred(self, states: np.ndarray, actions: np.ndarray, own_weight: np.ndarray) -> TransferredInstances: ...
+    def transferred_to_sample(
+        self, points: np.ndarray, actions: np.ndarray, own_weight: np.ndarray
+    ) -> TransferredInstances: ...
+    def prior(self, states: np.ndarray, actions: np.ndarray) -> PriorPredictions: ...
+    def prior_version(self) -> int: ...
 
 
 class Model(ABC):
@@ -172,7 +166,7 @@ class Model(ABC):
         predictions = self.predict(self.grid.states_of(points), actions)
         self.own_weight[pairs] = predictions.weight
         self.known[pairs] = predictions.weight >= self.exploration_threshold
-        modelled = self.known[pairs].copy()
+        modelled = self.known[pairs]
         if self.transfer is not None and not modelled.all():
             given = self.transfer.transferred_to_sample(points, actions, predictions.weight)
             predictions, modelled = join(predictions, given, modelled)

@@ -94,8 +94,7 @@ class GridModel(Model):
         # The transition whose outcome was the first to tell states apart; 0: none has.
         self._first_reward, self._informed_at = np.nan, 0
         # A variable that hardly ever changes is measured by this part of a cell.
-        least = [1e-9, 1e-9] if settings.ends_by_action else [1e-9]
-        least_size = np.append(LEAST_SIZE / self.grid.arrays.cells, least)
+        least_size = np.append(LEAST_SIZE / self.grid.arrays.cells, [1e-9] * (1 + settings.ends_by_action))
         # Of effects, rewards and ends: sums of sizes by action, the least mean sizes; the last instance's, and mean sizes.
         n = len(least_size)
         self._measured = np.zeros((self.n_actions, n)), least_size, np.zeros(n), np.zeros(n)

@@ -92,7 +92,7 @@ def predict_own(experience, linear, grid, has_prior, state, kernel, threshold, f
     """Predict every action at ``state`` from the instances nearest to it, and from the prior; the least weight one has.
 
     :param experience: (instances, arrivals, ends); plain tuples all of them
-    :param corners: work space: position, corner_index, corner_weight (see ``corners_of``)
+    :param corners: work space: position, corner_index and corner_weight of ``RowScratch``
     """
     instances = Instances(*experience[0])
     experience = instances, Instances(*experience[1]), Ends(*experience[2])

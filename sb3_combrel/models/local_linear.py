@@ -51,7 +51,6 @@ class LocalLinear(GridModel):
         self.linear = LinearArrays(np.zeros((n_pairs, 2 * d)), np.zeros(d), np.full(self.n_actions, np.inf))
         self._fit = tuple(LocalFit.empty(n_near, d, settings.ends_by_action))
         self._scratch = tuple(LinearScratch(*(np.empty(n) for n in (d, d, d, d, 2, 2 * d))))
-        self._corners = np.empty(d), np.empty(2**d, dtype=np.int64), np.empty(2**d)
         self._prior_version = -1
 
     def _slot_for(self, state: np.ndarray, action: int) -> tuple[int, np.ndarray]:
@@ -111,6 +110,6 @@ class LocalLinear(GridModel):
 
     def _predict_own(self, state: np.ndarray) -> float:
         model = self._plain_experience, tuple(self.linear), self.grid.plain, self._prior is not None
-        scratch = self._fit, self._scratch, self._corners
+        scratch = self._fit, self._scratch, self.mdp.scratch[1:4]
         given = *model, state, tuple(self.kernel), self.exploration_threshold, *scratch, tuple(self._prediction)
         return float(predict_own.call(*given))

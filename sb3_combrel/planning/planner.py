@@ -75,7 +75,6 @@ def sweep_changes(values, mdp, upper, worth, lowest, searching, tolerance, told,
     A value that has changed by more than ``tolerance`` bears on the points from which a pair may lead there. When as many have
     been marked as there are points, all are backed up.
 
-    :param values: updated in place
     :param told: each value when its change was last passed on
     :param changed: bool, shape (n_points,): points to be backed up; in place
     :param span: see ``MDPArrays``; plain tuple for ``grid``
