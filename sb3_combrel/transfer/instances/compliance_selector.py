@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from sb3_combrel.transfer.candidates import Candidates
 from sb3_combrel.transfer.instances.bandwidths import CandidateBandwidths
 from sb3_combrel.transfer.instances.compliance import ComplianceTable
 from sb3_combrel.transfer.instances.nearest_transitions import ComplianceCache, add_to_sample, choose, select
-from sb3_combrel.transfer.instances.selectors import Confidence, Ranges, Selector, ranges_of
+from sb3_combrel.transfer.instances.selectors import Ranges, Selector, ranges_of
 
 # Within an episode choices are renewed whenever this many times as much has been recorded as at the last time: to plan again
 # with every transition would cost more than all the rest.
@@ -173,13 +174,13 @@ class ComplianceSelector(Selector):
         total = np.where(counted, compliance, 0.0).sum(axis=1)
         return np.where(n_counted > 0, total / np.maximum(n_counted, 1), np.nan)
 
-    def confidence(self, action: int) -> Confidence | None:
+    def confidence(self, action: int) -> dict[str, Any]:
         n_points = len(self.task.sample_states)
         pairs = action * n_points + np.arange(n_points)
         # What is known needs no choice any more, and its choice is not renewed.
         pairs = pairs[(self._choice[pairs] >= 0) & ~self._due.ravel()[pairs]]
         if len(pairs) == 0:
-            return None
+            return {}
         if len(pairs) > MAX_COMPARED:
             pairs = pairs[(np.arange(MAX_COMPARED) * (len(pairs) / MAX_COMPARED)).astype(np.int64)]
         self._measure(self._near[pairs])
@@ -189,8 +190,9 @@ class ComplianceSelector(Selector):
             mean, chosen = self._cache.compliance[near, :n_candidates].mean(axis=0), candidate - self.first[action]
             no_change = np.mean([self._table.no_change(self.transitions, i) for i in near.tolist()])
             compared.append((mean[chosen], np.delete(mean, chosen).max(initial=-np.inf), no_change))
-        chosen_mean, next_best, no_change = np.array(compared).mean(axis=0).tolist()
-        return Confidence(chosen_mean, next_best if n_candidates > 1 else np.nan, no_change)
+        compliance, next_best, no_change = np.array(compared).mean(axis=0).tolist()
+        next_best = next_best if n_candidates > 1 else np.nan
+        return {"compliance": compliance, "next_best_compliance": next_best, "no_change_compliance": no_change}
 
     def get_state(self) -> dict[str, np.ndarray]:
         return {

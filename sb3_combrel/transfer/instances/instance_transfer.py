@@ -9,7 +9,7 @@ import numpy as np
 
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.transfer.instances.instances_check import InstancesCheck
-from sb3_combrel.transfer.instances.selectors import Confidence, Ranges, Selector
+from sb3_combrel.transfer.instances.selectors import Ranges, Selector
 from sb3_combrel.transfer.instances.translation import Translator
 from sb3_combrel.transfer.outcome_evidence import RegionErrors
 from sb3_combrel.transfer.report import MappingReport, TransferReport, describe_sources
@@ -166,17 +166,14 @@ class InstanceTransfer:
             best = max(of_action, key=lambda each: (of_action[each], -each))
             words = f"{parts_of[best].source_action} with {parts_of[best].state_mapping}"
             share = of_action[best] / sum(of_action.values())
-        sure = self.selector.confidence(action) or Confidence(np.nan, np.nan, np.nan)
         return MappingReport(
             target_action=self.task.action_names[action],
             mapping=words,
             share=share,
             n_mappings=len(of_action),
-            compliance=sure.chosen,
-            next_best_compliance=sure.next_best,
-            no_change_compliance=sure.no_change,
             error=float(self.errors.errors()[action]),
             n_compared=compared,
+            **self.selector.confidence(action),
         )
 
     def get_state(self) -> dict[str, np.ndarray]:

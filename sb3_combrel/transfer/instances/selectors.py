@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -16,14 +16,6 @@ Ranges = tuple[np.ndarray, np.ndarray]
 def ranges_of(chosen: np.ndarray) -> Ranges:
     """Return the ranges that hold one candidate each; empty ones for -1."""
     return np.maximum(chosen, 0), chosen + 1
-
-
-class Confidence(NamedTuple):
-    """How sure choices are: mean compliances with the nearest transitions, averaged over states of the sample."""
-
-    chosen: float
-    next_best: float  # of the best of all others there; NaN if there are none
-    no_change: float
 
 
 class Selector(ABC):
@@ -78,9 +70,9 @@ class Selector(ABC):
         """Return the candidate of each pair of the sample, int64, shape (n_actions * n_points,); -1: not a single one."""
         return np.full(self.task.n_actions * len(self.task.sample_states), -1, dtype=np.int64)
 
-    def confidence(self, action: int) -> Confidence | None:
-        """Compare the choices for a target action with others; None where nothing is chosen by compliance."""
-        return None
+    def confidence(self, action: int) -> dict[str, Any]:
+        """Return the compliances of ``MappingReport`` for a target action; none where nothing is chosen by compliance."""
+        return {}
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Return what is to be saved besides the transitions."""
