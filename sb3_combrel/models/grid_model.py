@@ -78,10 +78,8 @@ class GridModel(Model):
 
     def __init__(self, mdp: FiniteMDP, settings: ModelSettings, transfer: InstanceTransfer | None = None):
         super().__init__(mdp, settings, transfer)
-        # A transfer method is the prior of the fits, or gives instances for pairs that are not known.
         is_prior = self.takes_prior and transfer is not None and transfer.use == "prior"
-        self._prior: InstanceTransfer | None = transfer if is_prior else None
-        self._giver: InstanceTransfer | None = None if is_prior else transfer
+        self._prior = transfer if is_prior else None
         breadth = float(settings.model_breadth)
         self.kernel = Kernel(
             scale=-1.0 / breadth**2,
@@ -103,6 +101,11 @@ class GridModel(Model):
         self._points = tuple(PointScratch(along, span, due, predicted=np.empty(n)))
         self._prediction = Prediction.empty(self.n_actions, self._own_room, self.grid.n_variables)
         self._take_in_arrays()
+
+    @property
+    def _giver(self) -> InstanceTransfer | None:
+        """Where instances come from for pairs that are not known; a transfer method that is a prior gives none."""
+        return None if self._prior is not None else self.transfer
 
     @property
     def _informed(self) -> bool:
