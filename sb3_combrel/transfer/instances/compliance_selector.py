@@ -219,7 +219,7 @@ class ComplianceSelector(Selector):
     def sample_moved(self) -> None:
         before = self.n_switches
         self._choice[:] = -1
-        self._renew(np.flatnonzero(self._near_of_pair[:, 0] >= 0))
+        self._renew(np.flatnonzero(self._near[:, 0] >= 0))
         self.n_switches = before
 
     def statistics(self) -> dict[str, float]:
