@@ -178,7 +178,7 @@ class ComplianceSelector(Selector):
         n_points = len(self.task.sample_states)
         pairs = action * n_points + np.arange(n_points)
         # What is known needs no choice any more, and its choice is not renewed.
-        pairs = pairs[(self._choice[pairs] >= 0) & ~self._due.ravel()[pairs]]
+        pairs = pairs[(self._choice[pairs] >= 0) & ~self._due[pairs]]
         if len(pairs) == 0:
             return {}
         if len(pairs) > MAX_COMPARED:
