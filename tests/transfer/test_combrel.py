@@ -41,7 +41,8 @@ def test_at_a_state_of_the_sample_the_choice_and_the_instances_are_those_of_the_
         method.note_use(asking.transferred_at(method, POINTS[point], own))
     assert n_transferred > 20
     counts, figures = method.mapping_counts(), method.statistics()
-    assert counts == sorted(counts, key=lambda entry: -entry[1])
+    in_order = sorted(method.uses().items(), key=lambda use: (-use[1], use[0]))
+    assert counts == [(method.describe(candidate), n) for candidate, n in in_order], "whatever was used first"
     assert figures["transfer/uses"] == sum(n for _, n in counts) == n_transferred
     assert 0.0 <= figures["transfer/choice_entropy"] <= np.log(figures["transfer/distinct_mappings"]) + 1e-9
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields
 from functools import partial
@@ -281,7 +280,9 @@ class MappingTransfer(Transfer):
 
     def mapping_counts(self) -> list[tuple[str, int]]:
         """Return how often each candidate's instances were used, the most used first, by name."""
-        return [(self.describe(candidate), n) for candidate, n in Counter(self.uses()).most_common()]
+        # Those that were used as often by their number, not by when they were used first, which is not saved.
+        most_used = sorted(self.uses().items(), key=lambda use: (-use[1], use[0]))
+        return [(self.describe(candidate), n) for candidate, n in most_used]
 
     @property
     def region_errors(self) -> RegionErrors:
