@@ -216,7 +216,7 @@ def compare_learning(
     if threshold is not None:
         first, second = (time_to_threshold(curves, threshold, window) for curves in both)
         effect, low, high = bootstrap_difference(first, second, "median", n_resamples, seed)
-        p_value = p_value_of_difference(first, second, "mann-whitney")
+        p_value = p_value_of_difference(first, second, "mann-whitney", seed)
         times = Comparison(first, second, effect, low, high, p_value, higher_is_better=False)
     return TransferMeasures(
         jumpstart=compare(lambda curves: initial_return(curves, n_first)),

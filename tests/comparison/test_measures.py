@@ -93,7 +93,7 @@ def test_effects_are_tested_and_measured_by_the_statistics_of_the_package():
     assert jumpstart.higher_is_better and not measures.time_to_threshold.higher_is_better
     one, other = time_to_threshold(first, -40.0), time_to_threshold(second, -40.0)
     assert measures.time_to_threshold[2:5] == tuple(bootstrap_difference(one, other, "median", 500, 9))
-    assert measures.time_to_threshold.p_value == p_value_of_difference(one, other, "mann-whitney")
+    assert measures.time_to_threshold.p_value == p_value_of_difference(one, other, "mann-whitney", 9)
     again = compare_learning(first, second, threshold=-40.0, n_first=3, n_resamples=500, seed=9)
     np.testing.assert_equal(again, measures)
 
