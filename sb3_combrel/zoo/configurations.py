@@ -21,22 +21,26 @@ def with_configuration(args: Sequence[str]) -> list[str]:
 
     For an algorithm of RL-Zoo's own that is only so if the file has an entry for the very task.
     """
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    # With abbreviations, such as --conf, as RL-Zoo's own parser takes them.
+    parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--algo", default="ppo")
     parser.add_argument("--env", default="CartPole-v1")
     parser.add_argument("-conf", "--conf-file")
     given, _ = parser.parse_known_args(list(args))
+    if given.conf_file is not None:
+        if Path(given.conf_file).is_file():
+            check_configuration(Path(given.conf_file))
+        return list(args)
     file = FOLDER / f"{given.algo}.yml"
-    if given.conf_file is not None and Path(given.conf_file).is_file():
-        check_configuration(Path(given.conf_file))
-    if given.conf_file is not None or not file.is_file():
+    if not file.is_file():
         return list(args)
     if given.algo not in ALGORITHMS:
         import yaml
 
         if given.env not in yaml.safe_load(file.read_text()):
             return list(args)
-    return [*args, "--conf-file", str(file)]
+    # Before the others: of an option that is given twice the last counts, so the user's file does, however it is spelt.
+    return ["--conf-file", str(file), *args]
 
 
 def check_configuration(file: Path) -> None:

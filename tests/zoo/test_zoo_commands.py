@@ -99,11 +99,19 @@ def test_a_configuration_that_is_none_is_said_in_one_sentence(tmp_path, capsys, 
 
 def test_a_configuration_of_this_package_is_found_where_none_is_named():
     ours = [str(CONFIGS / f"{algo}.yml") for algo in ("combrel", "dqn")]
-    assert with_configuration(["--algo", "combrel", "--env", "CartPole-v1"])[-2:] == ["--conf-file", ours[0]]
-    assert with_configuration(["--algo", "dqn", "--env", CAR])[-2:] == ["--conf-file", ours[1]]
-    others = ["--algo=dqn", "--env=CartPole-v1"], ["--algo", "combrel", "-conf", "own.yml"], ["--algo", "a2c", "--env", CAR]
-    for args in others:
-        assert with_configuration(args) == args, "RL-Zoo's own, or the user's"
+    assert with_configuration(["--algo", "combrel", "--env", "CartPole-v1"])[:2] == ["--conf-file", ours[0]]
+    assert with_configuration(["--algo", "dqn", "--env", CAR])[:2] == ["--conf-file", ours[1]]
+    for args in (["--algo=dqn", "--env=CartPole-v1"], ["--algo", "a2c", "--env", CAR]):
+        assert with_configuration(args) == args, "RL-Zoo's own"
+
+
+@pytest.mark.parametrize("option", [["-conf", "{}"], ["--conf-file", "{}"], ["--conf", "{}"], ["--conf={}"]])
+def test_a_configuration_of_the_users_is_taken_and_checked_however_its_option_is_spelt(tmp_path, option):
+    args = ["--algo", "combrel", *(part.format(write_config(tmp_path / "own.yml")) for part in option)]
+    assert with_configuration(args) == args
+    (tmp_path / "own.yml").write_text("MountainCar-v0: 5")
+    with pytest.raises(ValueError, match="must have settings by name"):
+        with_configuration(args)
 
 
 def test_past_data_come_from_a_configuration_or_the_command_line(tmp_path):
