@@ -8,6 +8,7 @@ from helpers.command_line import call_for_all_output
 import combrel_envs  # noqa: F401 - registers the tasks
 from sb3_combrel import SourceInstances
 from sb3_combrel.common.version import __version__
+from sb3_combrel.experiments.paper.domains import ICUB, MOUNTAIN_CAR
 
 
 class TestRecord:
@@ -57,3 +58,12 @@ class TestCommandLine:
         monkeypatch.setitem(sys.modules, "tyro", None)
         status, written = call_for_all_output("demo")
         assert status == 1 and "sb3-combrel[experiments]" in written
+    def test_help_says_how_many_runs_a_setting_has(self):
+        written = " ".join(call_for_all_output("reproduce", "--help")[1].replace("│", " ").split())
+        car, robot = MOUNTAIN_CAR.settings, ICUB.settings
+        assert robot["paper"].n_runs == robot["best"].n_runs
+        n_runs = (
+            f"{robot['best'].n_runs} on the iCub, on Mountain Car {car['paper'].n_runs} in setting paper, {car['best'].n_runs}"
+        )
+        assert n_runs in written
+
