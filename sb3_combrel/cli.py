@@ -45,7 +45,7 @@ def record(
     /,
     output: Path = Path("source.npz"),
     n_instances: int = 1000,
-    total_timesteps: int = 30_000,
+    total_timesteps: int | None = None,
     seed: int = 0,
     method: str = "random",
     overwrite: bool = False,
@@ -58,7 +58,7 @@ def record(
         package:Task-v0
     :param output: file to write
     :param n_instances: instances to keep
-    :param total_timesteps: steps of Q-learning
+    :param total_timesteps: steps of Q-learning, by default 30,000
     :param seed: seed of learner, task and sample
     :param method: how to choose the instances, "random" or "covering"
     :param overwrite: replace the file if it exists
@@ -66,6 +66,8 @@ def record(
     from rich.console import Console
 
     from sb3_combrel import SourceInstances
+    from sb3_combrel.common.checks import check_count
+    from sb3_combrel.common.files import check_folder
     from sb3_combrel.common.scaling import has_bounds
     from sb3_combrel.runs.job import make_env
 
@@ -73,11 +75,17 @@ def record(
     file = output if output.suffix == ".npz" else output.with_name(output.name + ".npz")
     if file.exists() and not overwrite:
         raise ValueError(f"{file} exists; use --overwrite or another --output")
+    check_count("seed", seed, min=0)
+    check_folder("output", file.parent)
     asked: dict[str, Any] = {"n_instances": n_instances, "seed": seed, "method": method}
     with closing(make_env(env_id)) as env:
         if has_bounds(env.observation_space):
-            with console.status(f"Learning {env_id} by Q-learning for {total_timesteps:,} steps ..."):
-                source = SourceInstances.from_q_learning(env, total_timesteps=total_timesteps, **asked)
+            steps = 30_000 if total_timesteps is None else total_timesteps
+            with console.status(f"Learning {env_id} by Q-learning for {steps:,} steps ..."):
+                source = SourceInstances.from_q_learning(env, total_timesteps=steps, **asked)
+        elif total_timesteps is not None:
+            why = f"{env_id} has state variables without bounds, and is learned by 100 episodes of Fitted R-Max"
+            raise ValueError(f"total_timesteps must be left out, got {total_timesteps}: {why}")
         else:
             with console.status(f"Learning {env_id} by Fitted R-Max, as its state variables have no bounds ..."):
                 source = SourceInstances.from_fitted_rmax(env, **asked)

@@ -36,6 +36,22 @@ class TestRecord:
         assert status == 0 and len(source) == 20 and source.origin["recorder"] == "FittedRMax", written
 
     @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (("--output", "/dev/null/source.npz"), "output must be in a folder that can be written to, got /dev/null"),
+            (("--seed", "-1"), "seed must be a whole number of at least 0, got -1"),
+        ],
+    )
+    def test_what_is_wrong_is_said_before_anything_is_learned(self, tmp_path, monkeypatch, arguments, message):
+        monkeypatch.setattr(SourceInstances, "from_q_learning", None)
+        status, written = call_for_all_output("record", *self.SHORT, "--output", tmp_path / "car", *arguments)
+        assert status == 1 and message in written and not list(tmp_path.iterdir())
+
+    def test_steps_of_q_learning_are_refused_where_it_cannot_learn(self, tmp_path):
+        status, written = call_for_all_output("record", "CartPole-v1", "--total-timesteps", "5", "--output", tmp_path / "pole")
+        assert status == 1 and "total_timesteps must be left out, got 5: CartPole-v1 has state variables" in written
+
+    @pytest.mark.parametrize(
         ("env_id", "message"),
         [("Nowhere-v0", "Nowhere"), ("no_such_package:Task-v0", "no_such_package"), ("Pendulum-v1", "Discrete")],
     )
@@ -51,13 +67,6 @@ class TestCommandLine:
         assert status == 0 and all(name in written for name in ("demo", "record", "reproduce", "benchmark"))
         assert call_for_all_output("dance")[0] == 2
 
-    def test_it_says_its_version(self):
-        assert call_for_all_output("--version") == (0, f"sb3-combrel {__version__}\n")
-
-    def test_without_tyro_the_command_names_what_to_install(self, monkeypatch):
-        monkeypatch.setitem(sys.modules, "tyro", None)
-        status, written = call_for_all_output("demo")
-        assert status == 1 and "sb3-combrel[experiments]" in written
     def test_help_says_how_many_runs_a_setting_has(self):
         written = " ".join(call_for_all_output("reproduce", "--help")[1].replace("│", " ").split())
         car, robot = MOUNTAIN_CAR.settings, ICUB.settings
@@ -67,3 +76,10 @@ class TestCommandLine:
         )
         assert n_runs in written
 
+    def test_it_says_its_version(self):
+        assert call_for_all_output("--version") == (0, f"sb3-combrel {__version__}\n")
+
+    def test_without_tyro_the_command_names_what_to_install(self, monkeypatch):
+        monkeypatch.setitem(sys.modules, "tyro", None)
+        status, written = call_for_all_output("demo")
+        assert status == 1 and "sb3-combrel[experiments]" in written
