@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,21 +18,21 @@ def with_evaluations(args: Sequence[str]) -> list[str]:
     if not (given.algos and given.env and given.exp_folders):
         return list(args)
     kept = []
-    folders = ", ".join(given.exp_folders)
+    # RL-Zoo has a curve, and a number in its table, for each of them.
+    shown = list(itertools.product(given.exp_folders, given.env))
     for algo in given.algos:
-        missing = [env for env in given.env if not _has_evaluations(given.exp_folders, algo, env)]
-        kept += [algo] if len(missing) < len(given.env) else []
+        missing = [(folder, env) for folder, env in shown if not _has_evaluations(folder, algo, env)]
+        kept += [algo] if len(missing) < len(shown) else []
         becomes = "it is 0.0 in the table" if algo in kept else "it is left out"
-        for env in missing:
-            _say(f"{algo} has no evaluations of {env} in {folders}: train it first, with --eval-freq; {becomes}")
+        for folder, env in missing:
+            _say(f"{algo} has no evaluations of {env} in {folder}: train it first, with --eval-freq; {becomes}")
     if not kept:
         raise ValueError("there is nothing to plot: none of the algorithms has evaluations; names take a hyphen, not a slash")
     return ["-a", *kept, "-e", *given.env, "-f", *given.exp_folders, *others]
 
 
-def _has_evaluations(folders: Sequence[str], algo: str, env: str) -> bool:
-    files = (file for folder in folders for file in Path(folder, algo.lower()).glob("*/evaluations.npz"))
-    return any(env in file.parent.name for file in files)
+def _has_evaluations(folder: str, algo: str, env: str) -> bool:
+    return any(env in file.parent.name for file in Path(folder, algo.lower()).glob("*/evaluations.npz"))
 
 
 def check_window(args: Sequence[str]) -> list[str]:

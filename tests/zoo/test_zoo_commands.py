@@ -149,6 +149,9 @@ def test_an_algorithm_without_evaluations_is_named_and_left_out_of_plots(tmp_pat
     options = ["-e", IN_LOGS, "-f", str(tmp_path), "--no-display"]
     assert with_evaluations(["-a", "combrel", "timbrel", *options]) == ["-a", "combrel", *options]
     assert f"timbrel has no evaluations of {IN_LOGS}" in capsys.readouterr().err
+    two = ["-a", "combrel", "-e", IN_LOGS, "-f", str(tmp_path), str(tmp_path / "empty")]
+    assert with_evaluations(two) == two
+    assert f"{IN_LOGS} in {tmp_path / 'empty'}: train it first, with --eval-freq; it is 0.0" in capsys.readouterr().err
     with pytest.raises(ValueError, match="nothing to plot"):
         with_evaluations(["-a", "timbrel", *options])
 
