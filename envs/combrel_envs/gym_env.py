@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, SupportsIndex
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.error import ResetNeeded
+from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 
 from combrel_envs import icub_tasks, mountain_car_dynamics
 from combrel_envs.checks import check_choice
@@ -119,6 +119,8 @@ class DmControlEnv(RenderedEnv):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin an episode; ``seed`` is that of the following ones too. For ``options`` see :meth:`_apply_options`."""
+        if self._closed:
+            raise ClosedEnvironmentError("reset() must come before close(), which has freed the simulation: make a new one")
         super().reset(seed=seed)
         if seed is not None:
             self._environment.task.random.seed(int(self.np_random.integers(2**32)))

@@ -12,7 +12,7 @@ import numpy as np
 
 from combrel_envs import mountain_car_dynamics as dynamics
 from combrel_envs import rendering
-from combrel_envs.checks import check_choice
+from combrel_envs.checks import check_choice, check_number
 
 rendering.import_dm_control()
 
@@ -61,6 +61,7 @@ def make_environment(
       time_limit: Steps until an episode is cut off.
       environment_kwargs: Arguments of `control.Environment`; for all others see `Climb`.
     """
+    check_number("time_limit", time_limit, "a number of steps above 0", lambda steps: steps > 0)
     task = Climb(start=start, random=random, action_noise=action_noise)
     return control.Environment(make_physics(n_axes), task, time_limit=time_limit, **(environment_kwargs or {}))
 

@@ -114,6 +114,7 @@ def test_dm_controls_time_limit_is_the_same_and_can_be_set(env_id, unit, n_steps
         (("mountain_bike", "climb_2d"), "domain must be one of 'mountain_car', 'icub', got 'mountain_bike'"),
         (("mountain_car", "climb"), "must be one of 'climb_2d', 'climb_4d', 'climb_6d', got 'climb'"),
         (("mountain_car", "climb_2d", {"start": "top"}), "start must be one of"),
+        (("mountain_car", "climb_2d", {"time_limit": 0}), "time_limit must be a number of steps above 0, got 0"),
         (("icub", "kick"), r"task of 'icub' must be one of 'torso_strike', 'arm_strike', .*, got 'kick'"),
     ],
 )

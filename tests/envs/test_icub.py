@@ -5,7 +5,7 @@ import math
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.error import ResetNeeded
+from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from helpers.environments import ARM, ICUBS, NOISY, TORSO, observations, plan_of
 
 import combrel_envs
@@ -164,3 +164,9 @@ class TestOptions:
         with pytest.raises(ValueError, match=message):
             env.reset(options=options)
         np.testing.assert_allclose(env.reset()[0], STARTS[TORSO], atol=1e-5)
+
+    def test_a_reset_after_close_says_so(self):
+        env = gymnasium.make(TORSO)
+        env.close()
+        with pytest.raises(ClosedEnvironmentError, match=r"reset\(\) must come before close\(\)"):
+            env.reset()
