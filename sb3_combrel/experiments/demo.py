@@ -25,14 +25,24 @@ from sb3_combrel.experiments.film import film, greedy_episode
 from sb3_combrel.experiments.tasks import mountain_car
 from sb3_combrel.experiments.warm_up import warm_up
 from sb3_combrel.runs.episodes import EVALUATION_SEED, EpisodeRecorder
-from sb3_combrel.runs.job import Job, Result, chosen_on_purpose, make_env
-from sb3_combrel.runs.runner import FOLDER, Backend, check_all_succeeded, prepare_folder, result_file, run_missing
+from sb3_combrel.runs.job import Job, Result, chosen_on_purpose, file_name, make_env
+from sb3_combrel.runs.runner import (
+    FOLDER,
+    Backend,
+    check_all_succeeded,
+    prepare_folder,
+    read_result,
+    result_file,
+    run_missing,
+)
 from sb3_combrel.runs.source_files import FOLDER as SOURCES
 from sb3_combrel.runs.source_files import load_or_learn
 
 TENSORBOARD = "tensorboard"
 FIGURE, TABLES, RESULTS = "learning_curves.png", "tables.md", "results.csv"
 MODEL, VIDEO = "car.zip", "car.mp4"
+#: Of the file of each source, before its seed.
+SOURCE = "mountain_car_2d_seed"
 #: All that the demonstration writes into its folder.
 OUTPUTS = (SOURCES, FOLDER, TENSORBOARD, FIGURE, TABLES, RESULTS, MODEL, VIDEO)
 MAPPINGS_SHOWN = 8
@@ -118,14 +128,10 @@ def run_demo(
     if model_breadth is not None:
         check_positive("model_breadth", model_breadth)
     console = console or Console()
-    if fresh and (output / FOLDER).exists():
-        for name in OUTPUTS:
-            path = output / name
-            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
-        # By this folder the next line knows it as one of results, whatever else is in it.
-        (output / FOLDER).mkdir()
     prepare_folder(output)
-    files = [output / SOURCES / f"mountain_car_2d_seed{seed}.npz" for seed in range(n_seeds)]
+    if fresh:
+        _forget(output)
+    files = [output / SOURCES / f"{SOURCE}{seed}.npz" for seed in range(n_seeds)]
     sources = [load_or_learn(file, mountain_car.learn_source, seed, console) for seed, file in enumerate(files)]
     learner = {**mountain_car.LEARNER, **({} if model_breadth is None else {"model_breadth": model_breadth})}
     task: dict[str, Any] = {"env": mountain_car.TARGET_ID, "n_episodes": n_episodes, "max_episode_steps": max_episode_steps}
@@ -147,6 +153,29 @@ def run_demo(
     shutil.copyfile(_best([run for run in runs if run.method == FILMED], console).model_file, output / MODEL)
     _film(output, max_episode_steps, console)
     _epilogue(output, n_seeds, console)
+
+
+def _forget(output: Path) -> None:
+    """Delete what earlier calls have left, if there are results of the demonstration: files of their names, and its own."""
+    runs = [file.stem for file in (output / FOLDER).glob("*.json") if _is_of_demo(output, file.stem)]
+    if not runs:
+        return
+    logs = [log for name in runs for log in (output / TENSORBOARD).glob(f"{name}_[0-9]*")]
+    for log in logs:
+        shutil.rmtree(log, ignore_errors=True)
+    files = [output / FOLDER / f"{name}{suffix}" for name in runs for suffix in (".json", ".zip")]
+    files += [output / name for name in (FIGURE, TABLES, RESULTS, MODEL, VIDEO)]
+    for file in (*files, *(output / SOURCES).glob(f"{SOURCE}[0-9]*.npz")):
+        file.unlink(missing_ok=True)
+
+
+def _is_of_demo(output: Path, name: str) -> bool:
+    """Whether a file of a name is a result of the demonstration: the folder may have others'."""
+    read = read_result(output, name)
+    if read is None:
+        return False
+    settings, result = read
+    return settings.get("env") == mountain_car.TARGET_ID and name == file_name("", result.method, result.seed)
 
 
 def _report(results: Sequence[Result], cap: int, output: Path, console: Console) -> None:

@@ -188,6 +188,13 @@ def read_results(output: Path, begins: str = "") -> list[tuple[dict[str, Any], R
     return [each for each in found if each is not None and not each[1].error]
 
 
+def _is_of_results(output: Path) -> bool:
+    """Whether a folder has a result, or is of a call that was stopped before its first: TensorBoard's have our name, too."""
+    runs = output / FOLDER
+    has_result = any(read_result(output, file.stem) for file in runs.glob("*.json"))
+    return has_result or (runs.exists() and all(path.suffix in (".json", ".part", ".zip") for path in runs.iterdir()))
+
+
 def prepare_folder(output: Path) -> None:
     """Prepare a folder for results; those that are there are kept.
 
@@ -196,7 +203,7 @@ def prepare_folder(output: Path) -> None:
     """
     # What must not be read, or is no folder, is named by what follows.
     with suppress(PermissionError, NotADirectoryError):
-        if output.exists() and not (output / FOLDER).exists() and any(output.iterdir()):
+        if output.exists() and any(output.iterdir()) and not _is_of_results(output):
             raise ValueError(f"{output} has files that are not results of such runs; {USE_ANOTHER}")
     check_folder("output", output / FOLDER)
 

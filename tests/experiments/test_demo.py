@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from itertools import product
 
 import gymnasium
 import pytest
@@ -93,21 +94,30 @@ class TestDemo:
         assert {(row["steps"], row["reached_goal"]) for row in rows} == {("60", "0")}
 
     def test_fresh_deletes_earlier_results_and_nothing_of_the_users(self, folder, no_film):
-        (folder / "notes.txt").write_text("mine")
+        mine = [folder / name for name in ("notes.txt", "sources/mine.npz", "runs/PPO_1/log", "tensorboard/PPO_1/log")]
+        for file in mine:
+            file.parent.mkdir(exist_ok=True)
+            file.write_text("mine")
         status, written = run_tiny_demo(folder, "--fresh", "--max-episode-steps", "50", "--seeds", "1")
         assert status == 0 and "complete already" not in written, written
         assert {row["steps"] for row in rows_of(folder / "results.csv")} == {"50"}
-        assert (folder / "notes.txt").read_text() == "mine"
+        assert all(file.read_text() == "mine" for file in mine)
+        assert len(list(folder.glob("tensorboard/*_seed*"))) == len(list(folder.glob("runs/*.json"))) == len(METHODS)
+        assert len(list(folder.glob("sources/mountain*"))) == 1
 
     def test_a_folder_of_other_things_is_left_alone_and_bad_numbers_are_refused(self, tmp_path):
         (tmp_path / "source.npz").write_text("mine")
-        for more in ((), ("--fresh",)):
-            status, written = run_tiny_demo(tmp_path, *more)
-            assert status == 1 and "--output" in written
+        project = tmp_path / "project"
+        (project / "runs" / "PPO_1").mkdir(parents=True)  # TensorBoard's default name
+        (project / "results.csv").write_text("mine")
+        for folder, more in product((tmp_path, project), ((), ("--fresh",))):
+            status, written = run_tiny_demo(folder, *more)
+            assert status == 1 and "has files that are not results of such runs; use another folder by --output" in written
         for option in ("--seeds", "--episodes", "--max-episode-steps", "--workers"):
             status, written = call_for_all_output("demo", "--output", tmp_path / "new", option, "0")
             assert status == 1 and "of at least 1" in written and "got 0" in written
-        assert [path.name for path in tmp_path.iterdir()] == ["source.npz"]
+        left = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")}
+        assert left == {"source.npz", "project", "project/runs", "project/runs/PPO_1", "project/results.csv"}
 
     @pytest.mark.long
     @pytest.mark.parametrize("renderer", ["egl", "disable"])
