@@ -128,7 +128,8 @@ def run_missing(
     console: Console | None = None,
 ) -> list[Result]:
     """
-    Carry out the jobs that have no result yet. One that fails does not stop the others, and is tried again by the next call.
+    Carry out the jobs that have no result yet. One that fails does not stop the others, and is tried again by the next call, whose settings
+    may be others.
 
     Results are the same wherever a job is carried out, if they depend on the job alone.
 
@@ -209,19 +210,19 @@ def prepare_folder(output: Path) -> None:
 
 
 def _read_all(jobs: Sequence[Job], output: Path) -> dict[str, Result]:
-    """Results by name, without those that failed."""
+    """Results by name, without those that failed; ValueError if one is of other settings."""
     prepare_folder(output)
     found = {}
     for job in jobs:
         read = read_result(output, job.name)
-        if read is None:
+        # A run that failed is carried out again, with whatever settings: to mend these may be why the call is repeated.
+        if read is None or read[1].error:
             continue
         now = _settings(job)
         other = "; ".join(text for key in now for text in _differences(key, read[0].get(key), now[key]))
         if other:
             raise ValueError(f"{output} has results of other settings ({job.title}: {other}); {USE_ANOTHER}")
-        if not read[1].error:
-            found[job.name] = read[1]
+        found[job.name] = read[1]
     return found
 
 

@@ -108,6 +108,8 @@ def test_a_failed_job_is_kept_with_its_error_tried_again_and_does_not_stop_the_o
     ):
         runner.check_all_succeeded(found)
     runner.check_all_succeeded(found[2:])
+    mended = runner.run_missing(toys(tmp_path, 2, method="bad"), tmp_path / "out", HERE)
+    assert [result.error for result in mended] == ["", ""], "settings may differ from those that failed"
 
 
 def test_jobs_that_cannot_be_told_apart_or_sent_are_refused(tmp_path):
