@@ -53,8 +53,12 @@ class ComparedRun(Job):
 
     @property
     def name(self) -> str:
-        """Name of the run in files, with a digest: methods may differ in case or punctuation alone, or at their ends."""
-        digest = hashlib.sha256(self.method.encode()).hexdigest()[:8]
+        """Name of the run in files, with a digest: methods may differ in case or punctuation alone, or at their ends.
+
+        In that of the control its settings count: it is another one where another method comes first.
+        """
+        told_by = self.method if self.method != CONTROL else json.dumps([self.method, self.in_use])
+        digest = hashlib.sha256(told_by.encode()).hexdigest()[:8]
         return file_name(self.method[:NAME_LENGTH], f"{digest}{' shown' if self.is_shown else ''}", self.seed)
 
     def settings(self) -> dict[str, Any]:

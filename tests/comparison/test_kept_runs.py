@@ -22,6 +22,7 @@ from sb3_combrel import COMBREL, MappingSet, SourceInstances
 from sb3_combrel.common.files import write_whole
 from sb3_combrel.comparison import compare as module
 from sb3_combrel.comparison.compare import ComparedRun, compare
+from sb3_combrel.comparison.controls import CONTROL
 from sb3_combrel.runs.job import described
 from sb3_combrel.runs.runner import FOLDER, Backend, run_missing
 
@@ -89,6 +90,15 @@ def test_more_seeds_and_methods_use_what_is_there(carried_out, tmp_path):
     carried_out.clear()
     quietly(output=tmp_path, seeds=[1], methods={"none": None, "more": None}, baseline="none")
     assert carried_out == [("none", 1), ("more", 1)]
+
+
+def test_a_method_before_the_others_may_change_the_control(carried_out, tmp_path):
+    """It is the first method's that chooses a mapping; with the others alone the control that was is still there."""
+    more = {"none": None, "onto": COMBREL(walk_source(), "surjective", use="instances"), **METHODS}
+    for methods, made in ((METHODS, ["none", "COMBREL", CONTROL]), (more, ["onto", CONTROL]), (METHODS, [])):
+        carried_out.clear()
+        found = quietly(output=tmp_path, methods=methods)
+        assert list(found.curves) == [*methods, CONTROL] and [name for name, _ in carried_out] == made
 
 
 def test_files_have_names_that_are_safe_and_differ():
