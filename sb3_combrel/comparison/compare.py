@@ -121,8 +121,9 @@ def compare(
     :param progress_bar: show which runs are complete; None: in a terminal or notebook
     :param output: folder in which finished runs are kept: the same call, or one with more methods or seeds, goes on from
         there. Where the source of the environment's class, its wrappers or the function that makes it, or that of a
-        method's class, has changed, it is refused, as where that of a class which these inherit from has. What else these
-        call is not noticed: take another folder then
+        method's class, has changed, it is refused, as where that of a class which these inherit from has, or a value that
+        the function holds: a default, a variable of an enclosing function, plain global data, attributes of its object;
+        and where the content of ``instances`` has. What else these call is not noticed: take another folder then
     :param learner: further arguments of :class:`~sb3_combrel.FittedRMax`, the same for all methods: ``gamma=0.99``
     :return: learning curves, measures, p-values, table, figure and sentence
     :raises TypeError: if :class:`~sb3_combrel.FittedRMax` has no such argument

@@ -128,8 +128,9 @@ def run_missing(
     console: Console | None = None,
 ) -> list[Result]:
     """
-    Carry out the jobs that have no result yet. One that fails does not stop the others, and is tried again by the next call, whose settings
-    may be others.
+    Carry out the jobs that have no result yet.
+
+    One that fails does not stop the others, and is tried again by the next call, whose settings may be others.
 
     Results are the same wherever a job is carried out, if they depend on the job alone.
 
@@ -146,7 +147,9 @@ def run_missing(
     if names.total() > len(names):
         raise ValueError(f"jobs must have different names, got {', '.join(name for name, n in names.items() if n > 1)} twice")
     folder = None if output is None else Path(output)
-    found = {} if folder is None else _read_all(jobs, folder)
+    # As they are before the first run, which may change what they are made from: a list that a function holds, or a file.
+    settings = {} if folder is None else {job.name: _settings(job) for job in jobs}
+    found = {} if folder is None else _read_all(jobs, settings, folder)
     missing = [job for job in jobs if job.name not in found]
     if found:
         console.print(f"{len(found)} of {len(jobs)} runs were complete already.")
@@ -154,7 +157,7 @@ def run_missing(
         for job, result in _carry_out(missing, backend):
             found[job.name] = result
             if folder is not None:
-                _write(job, result, folder)
+                _write(job, settings[job.name], result, folder)
             advance(job, result)
     return [found[job.name] for job in jobs]
 
@@ -209,7 +212,7 @@ def prepare_folder(output: Path) -> None:
     check_folder("output", output / FOLDER)
 
 
-def _read_all(jobs: Sequence[Job], output: Path) -> dict[str, Result]:
+def _read_all(jobs: Sequence[Job], settings: dict[str, dict[str, Any]], output: Path) -> dict[str, Result]:
     """Results by name, without those that failed; ValueError if one is of other settings."""
     prepare_folder(output)
     found = {}
@@ -218,7 +221,7 @@ def _read_all(jobs: Sequence[Job], output: Path) -> dict[str, Result]:
         # A run that failed is carried out again, with whatever settings: to mend these may be why the call is repeated.
         if read is None or read[1].error:
             continue
-        now = _settings(job)
+        now = settings[job.name]
         other = "; ".join(text for key in now for text in _differences(key, read[0].get(key), now[key]))
         if other:
             raise ValueError(f"{output} has results of other settings ({job.title}: {other}); {USE_ANOTHER}")
@@ -238,9 +241,9 @@ def _settings(job: Job) -> dict[str, Any]:
     return dict(json.loads(json.dumps({"version": __version__, **job.settings()})))
 
 
-def _write(job: Job, result: Result, output: Path) -> None:
+def _write(job: Job, settings: dict[str, Any], result: Result, output: Path) -> None:
     try:
-        content = {"settings": _settings(job), "result": to_plain(vars(result))}
+        content = {"settings": settings, "result": to_plain(vars(result))}
         write_whole(result_file(output, job.name), (json.dumps(content) + "\n").encode())
     except TypeError as error:
         raise TypeError(f"{job.title}: {error}, which a result in a folder has to be") from error

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import types
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import gymnasium as gym
@@ -18,7 +18,7 @@ from helpers.dashboard import NamedWalk
 from helpers.own_method import Mine
 from helpers.walk import Walk, walk_source
 
-from sb3_combrel import COMBREL, MappingSet, SourceInstances
+from sb3_combrel import COMBREL, FittedRMax, MappingSet, SourceInstances
 from sb3_combrel.common.files import write_whole
 from sb3_combrel.comparison import compare as module
 from sb3_combrel.comparison.compare import ComparedRun, compare
@@ -136,7 +136,12 @@ def with_combrel(source=None, **arguments):
             r"learner.resolution was 3 and is 4; learner.gamma was '\(not given\)' and is 0.9",
         ),
         ({}, dict(env=NamedWalk), r"env was 'helpers.walk.Walk \w{8}' and is 'helpers.dashboard.NamedWalk \w{8}'"),
-        (dict(env=tasks(20)), dict(env=tasks(30)), r"env\.\S*lambda> was .*20.* and is .*30"),
+        (dict(env=tasks(20)), dict(env=tasks(30)), r"env\.\S*lambda> \w{8}\.noise was 20 and is 30"),
+        (
+            {"instances": walk_source(60)},
+            {"instances": walk_source(61)},
+            "learner.instances was '60 instances .*' and is '61 instances ",
+        ),
         ({}, with_combrel(breadth=0.4), r"\(COMBREL, seed 0: transfer\.\S*COMBREL.breadth was .* and is 0.4\)"),
         ({}, with_combrel(walk_source(61)), "source was '60 instances .* and is '61 instances "),
         (dict(methods=sets(1, 0)), dict(methods=sets(1, 1)), "transfer.mappings was '<2 mappings.* and is '<2 mappings"),
@@ -163,6 +168,27 @@ def test_a_source_named_by_its_file_is_known_by_its_content(tmp_path):
         quietly(methods=methods(70), output=tmp_path / "kept", controls=False)
 
 
+def test_past_data_are_known_by_their_content(tmp_path):
+    def settings_of(given):
+        run = ComparedRun(group="", method="m", seed=0, env=Walk, learner={"instances": given, "gamma": 0.9})
+        return json.loads(json.dumps(run.settings()))["learner"]
+
+    few, many = walk_source(300), replace(walk_source(300), rewards=np.arange(300) / 1e12)
+    for kind in ("npz", "csv"):
+        found = []
+        for source in (few, few, many):
+            source.save(tmp_path / "log.npz") if kind == "npz" else source.to_table().to_csv(tmp_path / "log.csv")
+            found.append(settings_of(tmp_path / ("log" if kind == "npz" else "log.csv")))
+        assert found[0] == found[1] != found[2]
+    assert settings_of(few.to_table()) == settings_of(few.to_table()) != settings_of(many.to_table())
+    assert settings_of("a/minari-dataset-v0") == {"instances": "a/minari-dataset-v0", "gamma": 0.9}
+    model = FittedRMax(Walk(), seed=0, instances=few, resolution=3, degree=0)
+    assert settings_of(model) == settings_of(model.source_instances())
+    changes = dict(low=few.low - 1, high=few.high + 1, n_actions=3, state_names=("x", "y"), periodic=(True, False))
+    others = [described(replace(few, **({"action_names": ()} | {name: value}))) for name, value in changes.items()]
+    assert len({described(few), *others}) == 6 and described(replace(few, origin={"env": "other"})) == described(few)
+
+
 def test_settings_do_not_depend_on_where_things_lie_in_memory():
     class Odd:
         def __repr__(self):
@@ -172,10 +198,81 @@ def test_settings_do_not_depend_on_where_things_lie_in_memory():
         ComparedRun(group="", method="m", seed=0, env=gym.envs.registration.EnvSpec("Odd-v0", Walk, kwargs={"odd": Odd()}))
         for _ in range(2)
     )
+    assert described([np.random.default_rng(0), {"b", "a"}]) == ["Generator(PCG64)", str(["'a'", "'b'"])]
     settings = json.dumps(one.settings())
     assert settings == json.dumps(other.settings()) and " at 0x" not in settings and "helpers.walk.Walk" in settings
-    assert described(tasks(3)) == described(tasks(3)) != described(tasks(4))
     assert " at 0x" not in str(described(lambda: [each for each in (lambda: 3)()]))
+
+
+LIMIT = 0
+
+
+class Maker:
+    """Makes a task from an attribute; it knows itself, as an object may."""
+
+    def __init__(self, limit):
+        self.limit, self.own = limit, [self]
+
+    def __call__(self):
+        return Walk(limit=self.limit)
+
+
+@dataclass
+class Settings:
+    """An object whose repr leaves numbers out."""
+
+    limits: np.ndarray
+
+
+def enclosed(limit):
+    def make():
+        return Walk(limit=limit)
+
+    return make
+
+
+def with_global(limit, monkeypatch, make):
+    monkeypatch.setattr(sys.modules[__name__], "LIMIT", limit)
+    return described(make)
+
+
+def test_what_a_function_holds_tells_it_from_others(monkeypatch):
+    def of_global():
+        return [Walk(limit=LIMIT) for _ in range(1)]
+
+    def with_default(limit):
+        def make(limit=limit):
+            return Walk(limit=limit)
+
+        return make
+
+    def settings(limit):
+        return Settings(np.where(np.arange(3000) == 1500, limit + 1e-12, 0.0))
+
+    for made in (enclosed, tasks, Maker, lambda limit: Maker(limit).__call__, with_default, settings):
+        assert described(made(3)) == described(made(3)) != described(made(4))
+    for make in (of_global, lambda: Walk(limit=LIMIT)):
+        assert with_global(3, monkeypatch, make) == with_global(3, monkeypatch, make) != with_global(4, monkeypatch, make)
+    assert described(lambda a, b: a + b) != described(lambda a, b: a - b)
+    assert described(Walk(limit=3)) == described(Walk(limit=4)), "the attributes of an environment change as runs go on"
+
+
+def test_values_are_described_as_they_were_before_the_first_run(carried_out, tmp_path):
+    """A function may count what it makes; the same script, begun again, does so again."""
+
+    def counted():
+        made = []
+
+        def make():
+            made.append(0)
+            return Walk()
+
+        return make
+
+    for n_carried_out in (2, 0):
+        carried_out.clear()
+        quietly(env=counted(), output=tmp_path, controls=False)
+        assert len(carried_out) == n_carried_out
 
 
 def test_an_edited_environment_is_another(tmp_path, monkeypatch):
@@ -273,12 +370,12 @@ def test_what_is_typed_in_is_known_by_its_code(monkeypatch):
     assert (
         described(np.add.reduce).endswith(".reduce") and described(len) == "builtins.len"
     ), "compiled code has none to digest"
-    code = f"import sys; sys.path[:] = {sys.path}; from {__name__} import *; print(*map(described, typed_in()), sep='|')"
+    code = f"import sys; sys.path[:] = {sys.path}; from {__name__} import *; print(json.dumps([*map(described, typed_in())]))"
     for seed in ("1", "2"):
         environment = {**os.environ, "PYTHONHASHSEED": seed}
         call = [sys.executable, "-c", code]
         made = subprocess.run(call, env=environment, capture_output=True, text=True, check=True)
-        assert made.stdout.strip().split("|") == described_as
+        assert json.loads(made.stdout) == described_as
 
 
 class Unsaid(Mine):
