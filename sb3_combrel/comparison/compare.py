@@ -170,10 +170,7 @@ def compare(
     shown = console.is_terminal or console.is_jupyter if progress_bar is None else progress_bar
     results = run_missing(runs, output=folder, backend=Backend(n_jobs=n_jobs), console=console if shown else None)
     check_all_succeeded(results)
-    for result in results:
-        if not result.steps:
-            where = f"the run of {result.method}, seed {result.seed}"
-            raise ValueError(f"steps={steps} is too few: no episode ended in {where}; take more, or a time limit")
+    check_episodes(results, steps, folder)
     by_method = {method: results[k * len(numbers) : (k + 1) * len(numbers)] for k, method in enumerate(first)}
     found = evaluate(by_method, baseline, threshold, _name_of(env), name_of_control(in_use))
     for words in found.warnings:
@@ -223,6 +220,21 @@ def settings_of(transfer: Transfer | None) -> Any:
         return described(transfer)
     digest = hashlib.sha256(json.dumps(to_plain(mappings)).encode()).hexdigest()[:12]
     return {"mappings": f"{mappings!r} {digest}", "method": described(transfer)}
+
+
+def check_episodes(results: Sequence[Result], steps: int, folder: Path | None) -> None:
+    """Raise a ValueError if no episode has ended in a run, with the seeds that can be compared from what is kept."""
+    without = [each for each in results if not each.steps]
+    if not without:
+        return
+    runs = "; ".join(f"{each.method}, seed {each.seed}" for each in without)
+    wrong = f"steps={steps} is too few: no episode ended in the run of {runs}; take more, or a time limit"
+    left = sorted({each.seed for each in results} - {each.seed for each in without})
+    if left:
+        # Only the user can say whether what is left is a fair sample: these runs are the worst ones.
+        wrong += f". seeds={left} compares the others, without these, and says less of how bad a run may be"
+        wrong += "" if folder is None else f"; their runs are kept in {folder}"
+    raise ValueError(wrong)
 
 
 def check_output(output: Any) -> Path | None:

@@ -464,3 +464,13 @@ def test_a_report_that_cannot_be_kept_says_so(monkeypatch, tmp_path):
     assert run_missing([run], backend=Backend(n_jobs=1))[0].error == ""
     with pytest.raises(TypeError, match=r"Mine, seed 0: cannot write <object object .*> as plain data"):
         run_missing([run], tmp_path, Backend(n_jobs=1))
+
+
+def test_a_run_without_an_episode_does_not_lose_the_others(carried_out, tmp_path, monkeypatch):
+    carry_out = ComparedRun.carry_out
+    monkeypatch.setattr(ComparedRun, "carry_out", lambda run: replace(carry_out(run), **({"steps": []} if run.seed else {})))
+    call = dict(output=tmp_path, controls=False)
+    with pytest.raises(ValueError, match=r"run of none, seed 1; COMBREL, seed 1; .* seeds=\[0\] compares .* are kept in"):
+        quietly(**call, seeds=2)
+    carried_out.clear()
+    assert quietly(**call, seeds=[0]).n_steps > 0 and not carried_out
