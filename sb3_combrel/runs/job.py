@@ -40,9 +40,7 @@ _COMPILED_EPISODE = 30
 # What is in these changes with their versions.
 OURS = ("sb3_combrel", "combrel_envs", "gymnasium", "stable_baselines3")
 # Global data of these kinds count as part of the functions that name them.
-_PLAIN = (
-    type(None) | bool | int | float | complex | str | bytes | list | tuple | dict | set | frozenset | np.ndarray | np.generic
-)
+_PLAIN = (type(None), bool, int, float, complex, str, bytes, list, tuple, dict, set, frozenset, np.ndarray, np.generic)
 # What this process has learnt before.
 _compiled: set[tuple[str, str]] = set()
 
