@@ -29,6 +29,7 @@ from sb3_combrel.experiments.benchmark.scores import (
     n_compared,
     performance_of,
     ranks,
+    steps_of_all,
 )
 from sb3_combrel.runs.job import Result
 
@@ -59,7 +60,7 @@ def write_report(
         table = pair_table(pair, *own)
         made += write_tables([table], output / pair.name, console)
         made += draw_pair(pair, *own, output / pair.name)
-        sections.append(_section(pair, table))
+        sections.append(_section(pair, table, cells[pair.name]))
     overview = [rank_table(methods, cells, compared), performance_table(pairs, methods, cells, compared)]
     made += write_tables(overview, output / OVERVIEW, console)
     made.append(_write_runs(outcomes, output / RUNS))
@@ -166,8 +167,11 @@ def performance_table(pairs: Sequence[Pair], methods: Sequence[Method], cells: C
     return Table(title, ("method", *(pair.name for pair in pairs)), rows)
 
 
-def _section(pair: Pair, table: Table) -> str:
-    over = "episodes" if pair.n_steps is None else "environment steps"
+def _section(pair: Pair, table: Table, cells: Mapping[str, Cell]) -> str:
+    over = "episodes"
+    if pair.n_steps is not None:
+        n_steps, shortest = steps_of_all(cells)
+        over = f"the first {n_steps:,} steps, as many as all runs have in episodes that have ended (fewest: {shortest})"
     threshold = "" if pair.threshold is None else f" Threshold: a return of {pair.threshold:g}."
     text = f"{pair.description} Budget: {pair.budget}. Performance: mean return of an episode over {over}.{threshold}"
     return f"## {pair.name}\n\n{text}\n\n![{pair.name}]({pair.name}.png)\n\n{table.as_markdown()}"

@@ -84,14 +84,17 @@ def performances(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, np.ndarray]
     curves = {name: curves_of(cell.outcomes) for name, cell in cells.items() if cell.outcomes}
     if pair.n_steps is None:
         return {name: total_reward(each, pair.n_episodes) / float(pair.n_episodes or 1) for name, each in curves.items()}
-    n_steps = _steps_of_all(cells)
+    n_steps, _ = steps_of_all(cells)
     return {name: total_reward_by_steps(each, n_steps) / n_steps for name, each in curves.items()}
 
 
-def _steps_of_all(cells: Mapping[str, Cell]) -> int:
-    """Environment steps that each run has in episodes that have ended: what is measured over steps ends there, in all rows."""
-    curves = (curves_of(cell.outcomes) for cell in cells.values() if cell.outcomes)
-    return int(min((each.n_steps.min() for each in curves), default=1))
+def steps_of_all(cells: Mapping[str, Cell]) -> tuple[int, str]:
+    """Environment steps that each run has in episodes that have ended, and the run with the fewest.
+
+    What is measured over steps ends there, in all rows: a run that is stuck shortens all others.
+    """
+    ended = ((sum(each.steps), f"{name}, seed {each.seed}") for name, cell in cells.items() for each in cell.outcomes)
+    return min(ended, default=(1, "none"))
 
 
 def compare(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, MethodScores]:
@@ -100,7 +103,7 @@ def compare(pair: Pair, cells: Mapping[str, Cell]) -> dict[str, MethodScores]:
     without = of_runs.get(NONE)
     raw, measures = {}, {}
     floor = min((min(each.returns) for name in of_runs for each in cells[name].outcomes), default=0.0)
-    n_steps = _steps_of_all(cells)
+    n_steps, _ = steps_of_all(cells)
     for name, its_own in of_runs.items():
         # Of methods whose runs are the same, one is tested.
         if without is None or name == NONE or (cells[name].run_as != name and cells[name].run_as in of_runs):

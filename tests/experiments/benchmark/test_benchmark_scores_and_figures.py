@@ -244,6 +244,13 @@ class TestTables:
         assert rows["a"]["known mapping"] == "50%" and rows["a"]["steps to a mapping"] == "3" and rows["a"]["seconds"] == "1.5"
         assert rows["a"]["performance"].startswith(f"{naive_iqm([np.mean(e.returns) for e in cells['a'].outcomes]):.1f} [")
 
+    def test_over_steps_it_says_how_many_are_measured_and_whose_run_ends_them(self, tmp_path):
+        pair, outcomes = pair_of(n_steps=200), [outcome("made-up", NONE, seed, [-1.0] * 20) for seed in (0, 1)]
+        outcomes += [outcome("made-up", "a", 0, [-1.0] * 20), outcome("made-up", "a", 1, [-1.0] * 3)]
+        made = report.write_report([pair], self.METHODS, [0, 1], outcomes, tmp_path, ["command"], Console(quiet=True))
+        assert "over the first 30 steps, as many as all runs have" in made[-1].read_text()
+        assert "(fewest: a, seed 1)" in made[-1].read_text()
+
     def test_better_and_worse_than_none_are_counted(self, found):
         pair, cells, compared, _ = found
         table = report.rank_table(self.METHODS, {pair.name: cells}, {pair.name: compared})
