@@ -27,7 +27,8 @@ from sb3_combrel.fitted_rmax.arguments import MAX_SEED
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.mappings.mapping_set import MappingSet
 from sb3_combrel.pages.snapshot import snapshot_of
-from sb3_combrel.runs.job import Job, Result, Task, TransferLike, chosen_on_purpose, described, file_name
+from sb3_combrel.runs.described import described
+from sb3_combrel.runs.job import Job, Result, Task, TransferLike, chosen_on_purpose, file_name
 from sb3_combrel.runs.runner import Backend, check_all_succeeded, prepare_folder, run_missing
 from sb3_combrel.sources.recipes import task_spec
 from sb3_combrel.transfer.base import Transfer

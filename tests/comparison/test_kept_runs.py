@@ -23,7 +23,7 @@ from sb3_combrel.common.files import write_whole
 from sb3_combrel.comparison import compare as module
 from sb3_combrel.comparison.compare import ComparedRun, compare
 from sb3_combrel.comparison.controls import CONTROL
-from sb3_combrel.runs.job import described
+from sb3_combrel.runs.described import described
 from sb3_combrel.runs.runner import FOLDER, Backend, run_missing
 
 METHODS = {"none": None, "COMBREL": COMBREL(walk_source(), use="instances")}

@@ -18,7 +18,8 @@ from helpers.walk import Walk, walk_source
 
 from sb3_combrel import COMBREL
 from sb3_combrel.runs import runner
-from sb3_combrel.runs.job import Job, described, file_name, make_env
+from sb3_combrel.runs.described import described
+from sb3_combrel.runs.job import Job, file_name, make_env
 
 HERE = runner.Backend(n_jobs=1)
 

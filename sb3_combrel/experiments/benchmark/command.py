@@ -24,7 +24,8 @@ from sb3_combrel.experiments.benchmark.scores import n_compared
 from sb3_combrel.experiments.benchmark.third_party import load_attribute
 from sb3_combrel.experiments.suite.tasks import Source
 from sb3_combrel.fitted_rmax.arguments import MAX_SEED
-from sb3_combrel.runs.job import described, file_name
+from sb3_combrel.runs.described import described
+from sb3_combrel.runs.job import file_name
 from sb3_combrel.runs.runner import FOLDER as RUNS
 from sb3_combrel.runs.runner import LOCAL, Backend, JobError, prepare_folder, run_missing
 from sb3_combrel.runs.source_files import FOLDER, load_or_learn

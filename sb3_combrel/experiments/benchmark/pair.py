@@ -16,7 +16,8 @@ from sb3_combrel import FactoredMapping, InterTaskMapping, SourceInstances
 from sb3_combrel.common.checks import check_count, check_finite
 from sb3_combrel.experiments.suite.tasks import Source, check_budget
 from sb3_combrel.mappings.named_sets import check_mappings
-from sb3_combrel.runs.job import Task, chosen_on_purpose, described, make_env
+from sb3_combrel.runs.described import described
+from sb3_combrel.runs.job import Task, chosen_on_purpose, make_env
 from sb3_combrel.transfer.candidates import MappedVariables
 
 #: How a source is recorded, see :func:`recorded`.

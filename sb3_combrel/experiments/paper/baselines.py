@@ -20,8 +20,9 @@ from stable_baselines3.common.utils import LinearSchedule
 from sb3_combrel import COMBREL, FittedRMax, SourceInstances
 from sb3_combrel.experiments.paper.domains import ICUB, MOUNTAIN_CAR, Domain
 from sb3_combrel.experiments.tasks import icub_arm, mountain_car
+from sb3_combrel.runs.described import described
 from sb3_combrel.runs.episodes import EVALUATION_SEED, EpisodeRecorder, Episodes, play
-from sb3_combrel.runs.job import UNLIMITED, Job, Result, chosen_on_purpose, described
+from sb3_combrel.runs.job import UNLIMITED, Job, Result, chosen_on_purpose
 from sb3_combrel.sources.source_recorder import SourceRecorder
 from sb3_combrel.sources.transitions import Transitions
 from sb3_combrel.transfer.base import Transfer

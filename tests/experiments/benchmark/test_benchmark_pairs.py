@@ -23,7 +23,8 @@ from sb3_combrel.experiments.benchmark.pairs import (
 from sb3_combrel.experiments.benchmark.runs import has_mapping, jobs_of, known_share
 from sb3_combrel.experiments.tasks.cart_with_pendulum import make_cart_with_pendulum
 from sb3_combrel.experiments.tasks.disguised import disguise
-from sb3_combrel.runs.job import chosen_on_purpose, described, make_env
+from sb3_combrel.runs.described import described
+from sb3_combrel.runs.job import chosen_on_purpose, make_env
 from sb3_combrel.runs.runner import Backend, run_missing
 from sb3_combrel.transfer.candidates import MappedVariables
 
