@@ -38,6 +38,8 @@ from sb3_combrel.runs.job import Job, Result
 
 BACKENDS = ("loky", "ray", "dask")
 FOLDER = "runs"
+#: The file that tells our folder of runs from others' of that name, such as TensorBoard's, before there is a result.
+MARK = ".sb3_combrel"
 # Of a setting that one of two calls has not.
 ABSENT = "(not given)"
 USE_ANOTHER = "use another folder by --output or output="
@@ -192,13 +194,6 @@ def read_results(output: Path, begins: str = "") -> list[tuple[dict[str, Any], R
     return [each for each in found if each is not None and not each[1].error]
 
 
-def _is_of_results(output: Path) -> bool:
-    """Whether a folder has a result, or is of a call that was stopped before its first: TensorBoard's have our name, too."""
-    runs = output / FOLDER
-    has_result = any(read_result(output, file.stem) for file in runs.glob("*.json"))
-    return has_result or (runs.exists() and all(path.suffix in (".json", ".part", ".zip") for path in runs.iterdir()))
-
-
 def prepare_folder(output: Path) -> None:
     """Prepare a folder for results; those that are there are kept.
 
@@ -207,9 +202,13 @@ def prepare_folder(output: Path) -> None:
     """
     # What must not be read, or is no folder, is named by what follows.
     with suppress(PermissionError, NotADirectoryError):
-        if output.exists() and any(output.iterdir()) and not _is_of_results(output):
+        runs = output / FOLDER
+        is_ours = (runs / MARK).exists() or any(read_result(output, file.stem) for file in runs.glob("*.json"))
+        if output.exists() and any(output.iterdir()) and not is_ours:
             raise ValueError(f"{output} has files that are not results of such runs; {USE_ANOTHER}")
     check_folder("output", output / FOLDER)
+    if not (output / FOLDER / MARK).exists():
+        (output / FOLDER / MARK).touch()
 
 
 def _read_all(jobs: Sequence[Job], settings: dict[str, dict[str, Any]], output: Path) -> dict[str, Result]:

@@ -169,7 +169,9 @@ def test_what_was_learned_of_a_source_stays_when_the_learner_is_scaled_anew(make
     agent.rescale(StateScaling([-2.0, 0.0], [2.0, 2.0]), bounds)
     assert agent.model.n_instances == n_instances
     for name, array in transfer.get_state().items():
-        np.testing.assert_array_equal(array, before[name], err_msg=name)
+        # Choices are those of grid points, which are elsewhere now.
+        if name not in ("choice", "vote_due"):
+            np.testing.assert_array_equal(array, before[name], err_msg=name)
     if transfer.use != "prior":
         return
     states, actions = np.array([[0.5, 0.5]] * 2), np.arange(2)

@@ -89,7 +89,7 @@ def test_results_of_other_settings_and_other_files_are_neither_mixed_nor_overwri
     (tmp_path / "mine" / "thesis.txt").touch()
     with pytest.raises(ValueError, match="has files that are not results"):
         runner.run_missing(toys(tmp_path), tmp_path / "mine", HERE)
-    assert len(list((out / runner.FOLDER).iterdir())) == 3 and os.listdir(tmp_path / "mine") == ["thesis.txt"]
+    assert len(list((out / runner.FOLDER).glob("*.json"))) == 3 and os.listdir(tmp_path / "mine") == ["thesis.txt"]
 
 
 def test_a_failed_job_is_kept_with_its_error_tried_again_and_does_not_stop_the_others(tmp_path, capsys):

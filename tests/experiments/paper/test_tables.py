@@ -243,7 +243,8 @@ def test_the_csv_has_the_runs_of_earlier_calls_too(tmp_path):
     now = [made_up(CAR, m.COMBREL_PLAIN, seed, [10 + seed, 20]) for seed in (1, 0)]
     runner.run_missing([], tmp_path)
     for result in (earlier, *now, made_up(ROBOT, m.COMBREL_PLAIN, 0, [1, 1])):
-        runner._write(Job(group=result.group, method=result.method, seed=result.seed, env="Some-v0"), result, tmp_path)
+        job = Job(group=result.group, method=result.method, seed=result.seed, env="Some-v0")
+        runner._write(job, job.settings(), result, tmp_path)
     made = write_report(targets_of("table5", PAPER), PAPER, now, tmp_path, quiet())
     assert [path.name for path in made] == ["mountain_car.csv", "table5.md", "table5.csv"]
     assert made[0].read_text().splitlines() == [
