@@ -24,7 +24,7 @@ from sb3_combrel.common.version import __version__
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 from sb3_combrel.fitted_rmax.unpickling import check_pickles
-from sb3_combrel.transfer.by_name import check_argument_names, describe_transfer, make_transfer
+from sb3_combrel.transfer.by_name import check_argument_names, describe_transfer
 
 # The digits of real numbers hardly compress: higher levels take longer and gain a hundredth.
 COMPRESSION = 1
@@ -123,12 +123,11 @@ class SavedAlgorithm(BaseAlgorithm):
             with zipfile.ZipFile(archive) as content:
                 saved = json.loads(content.read("data")).get("transfer")
             archive.seek(0)
-        if "transfer" in kwargs and isinstance(saved, dict) and saved.get("arguments") is not None:
-            _check_same_transfer(kwargs.pop("transfer"), saved, path)
-        with _naming(path, changed):
             model = super().load(
                 archive, environment, device, custom_objects, print_system_info, force_reset, **kwargs  # type: ignore[arg-type]
             )
+        if "transfer" in kwargs and isinstance(saved, dict) and saved.get("arguments") is not None:
+            _check_same_transfer(model.policy.transfer, saved, path)
         if kwargs.keys() & OF_VALUES:
             model.policy.agent.plan_anew()
         _check_room(model.policy.agent.model.instances.size, model)
@@ -172,17 +171,13 @@ class SavedAlgorithm(BaseAlgorithm):
         return ["policy"], []
 
 
-def _check_same_transfer(given: Any, saved: dict[str, Any], path: object) -> None:
-    """:raises ValueError: if a method is not the one that :func:`describe_transfer` described, once it was bound"""
-    described = describe_transfer(make_transfer(given)) or {"method": None}
-    # What is left to the method is settled when it is bound.
-    wanted = {name: each for name, each in (described.get("arguments") or {}).items() if each is not None}
-    found = {name: saved["arguments"].get(name) for name in wanted}
-    if described["method"] != saved["method"] or json.dumps(wanted) != json.dumps(found):
+def _check_same_transfer(transfer: Any, saved: dict[str, Any], path: object) -> None:
+    """:raises ValueError: if a method, once it is bound, is not the one that :func:`describe_transfer` described"""
+    if json.dumps(describe_transfer(transfer), sort_keys=True) != json.dumps(saved, sort_keys=True):
         raise ValueError(
             f"transfer must be the method that {path} was saved with, with the same source and arguments, as what it has "
-            f"learned is kept, got {given!r} for {saved['method']}: leave it out, or make a new model with the instances: "
-            f"FittedRMax(env, instances={str(path)!r}, transfer=...)"
+            f"learned is kept, got {transfer!r} for {saved.get('method')}: leave it out, or make a new model with the "
+            f"instances: FittedRMax(env, instances={str(path)!r}, transfer=...)"
         )
 
 

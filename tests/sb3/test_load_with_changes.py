@@ -98,5 +98,18 @@ def test_a_transfer_method_may_be_given_again_and_no_other_as_what_it_has_learne
     model = small(transfer=method()).learn(30)
     model.save(tmp_path / "walk")
     assert same_parameters(FittedRMax.load(tmp_path / "walk", transfer=method()), model)
-    with pytest.raises(ValueError, match=r"^transfer must be the method that .*FittedRMax\(env, instances="):
+    with pytest.raises(
+        ValueError, match=r"(leave it out|leave out transfer), or make a new model.*FittedRMax\(env, instances="
+    ):
         FittedRMax.load(tmp_path / "walk", transfer=other)
+
+
+def test_a_source_in_a_file_may_be_given_again_while_it_is_the_same(tmp_path):
+    walk_source().save(tmp_path / "source.npz")
+    given = {"sb3_combrel.COMBREL": {"source": str(tmp_path / "source.npz")}}
+    model = small(transfer=given).learn(30)
+    model.save(tmp_path / "walk")
+    assert same_parameters(FittedRMax.load(tmp_path / "walk", transfer=given), model)
+    walk_source(80).save(tmp_path / "source.npz")
+    with pytest.raises(ValueError, match=r"^transfer must be the method that .*FittedRMax\(env, instances="):
+        FittedRMax.load(tmp_path / "walk", transfer=given)
