@@ -105,6 +105,8 @@ class FittedRMaxAgent:
         #: One thread at a time: predicting in one while another learns must be safe.
         self.lock = threading.RLock()
         self._q = QValues(task.n_actions, d)
+        # Most methods leave all actions to the agent: they are not asked at every step.
+        self._transfer_decides = type(self._method).action is not Transfer.action
         self._method.check_degree(1 if self.model_class.takes_prior else 0)
         self._bind()
         self._build()
@@ -163,7 +165,7 @@ class FittedRMaxAgent:
         with self.lock:
             if not explore:
                 return self._exploit(state)
-            decided = self._decided_by_transfer(state, environment)
+            decided = self._decided_by_transfer(state, environment) if self._transfer_decides else None
             return self._explore(state, environment) if decided is None else decided
 
     def _decided_by_transfer(self, state: np.ndarray, environment: int) -> int | None:

@@ -17,7 +17,7 @@ from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.periodic import differences
 from sb3_combrel.common.regression import Kernel
 from sb3_combrel.common.transferred import TransferredInstances
-from sb3_combrel.models.base import NO_PAIRS, InstanceTransfer, Model, ModelSettings, Predictions
+from sb3_combrel.models.base import MAX_PAIRS_AT_ONCE, NO_PAIRS, InstanceTransfer, Model, ModelSettings, Predictions
 from sb3_combrel.models.ends import Ends, put_arrivals, put_transition
 from sb3_combrel.models.grid_points import CAME, ENDED, WENT, PairArrays, PointScratch, note_instance
 from sb3_combrel.planning.mdp import FiniteMDP, add_successor
@@ -100,6 +100,8 @@ class GridModel(Model):
         span, due = np.empty((3, self.grid.n_variables), dtype=np.int64), np.empty(len(self.known), dtype=np.int64)
         self._points = tuple(PointScratch(along, span, due, predicted=np.empty(n)))
         self._prediction = Prediction.empty(self.n_actions, self._own_room, self.grid.n_variables)
+        # To as many pairs as are ever written at once.
+        self._nothing = tuple(TransferredInstances.empty(MAX_PAIRS_AT_ONCE, self.grid.n_variables))
         self._take_in_arrays()
 
     @property
@@ -231,10 +233,9 @@ class GridModel(Model):
 
     def _write_all_rows(self, pairs: np.ndarray, transferred: TransferredInstances | None = None) -> None:
         """Write the rows of pairs, and make room in the finite MDP where they need more; ``transferred``: to each of them."""
-        given = TransferredInstances.empty(len(pairs), self.grid.n_variables) if transferred is None else transferred
-        done = 0
+        given, done = self._nothing if transferred is None else tuple(transferred), 0
         while done < len(pairs):
-            done = self._write_rows((pairs, done), tuple(given))
+            done = self._write_rows((pairs, done), given)
             if done < len(pairs):
                 self.mdp.make_room()
 
