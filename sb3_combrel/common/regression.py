@@ -48,6 +48,8 @@ class LocalFit(NamedTuple):
     z: np.ndarray
     weighted: np.ndarray
     number: np.ndarray  # its numbers, float64, (n_numbers, groups, GROUP)
+    # By how much the effects of instances differ from what is fitted of them, float64, (n_neighbors, d).
+    residual: np.ndarray
 
     @classmethod
     def empty(cls, n_neighbors: int, n_variables: int, ends_by_action: bool = False) -> "LocalFit":
@@ -64,6 +66,7 @@ class LocalFit(NamedTuple):
             z=np.empty((d + 1, *groups)),
             weighted=np.empty((d + 1, *groups)),
             number=np.empty((n_numbers, *groups)),
+            residual=np.zeros((n_neighbors, d)),
         )
 
 
@@ -196,6 +199,27 @@ def fit_around(at, action, length, instances, kernel, fit):
     for p in range(1, d + 1):
         for v in range(n_numbers + 1):
             solution[p, v] *= per_unit
+
+
+@compiled
+def write_residuals(length, kernel, fit):
+    """Write the residuals of the effects; the weighted mean of their squared lengths, and the largest of these."""
+    d = fit.residual.shape[1]
+    per_unit = np.sqrt(-kernel_scale(fit, length, kernel))
+    total, sum_of_squares, largest = 0.0, 0.0, 0.0
+    for k in range(length):
+        g, lane = k // GROUP, k % GROUP
+        square = 0.0
+        for v in range(d):
+            residual = fit.number[v, g, lane] - fit.solution[0, v]
+            for j in range(d):
+                residual -= fit.solution[j + 1, v] * fit.z[j + 1, g, lane] / per_unit
+            fit.residual[k, v] = residual
+            square += residual * residual
+        total += fit.weighted[0, g, lane]
+        sum_of_squares += fit.weighted[0, g, lane] * square
+        largest = max(largest, square)
+    return sum_of_squares / total, largest
 
 
 @inlined

@@ -87,7 +87,8 @@ class GridModel(Model):
             n_neighbors=settings.n_neighbors,
             outcome_breadth=min(breadth, float(settings.outcome_breadth)) ** 2,
         )
-        self.pairs = PairArrays.empty(len(self.known), self.kernel.reach, self._fitted, is_prior)
+        n_kept = settings.n_neighbors if is_prior else 0
+        self.pairs = PairArrays.empty(len(self.known), self.kernel.reach, self._fitted, n_kept)
         self.own_weight, self.known = self.pairs.weight, self.pairs.known
         # The transition whose outcome was the first to tell states apart; 0: none has.
         self._first_reward, self._informed_at = np.nan, 0

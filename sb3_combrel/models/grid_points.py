@@ -26,14 +26,11 @@ class PairArrays(NamedTuple):
     surprise: np.ndarray  # float64, (n_pairs,)
     # Means and slopes of the numbers of ``LocalFit``; (n_pairs, 0, 0) for a model without.
     fit: np.ndarray  # float64, (n_pairs, d + 1, n_numbers)
-    # Where a prior joins the fits: those to the own instances alone, as ``LocalFit`` has solution, low and high.
-    own_fit: np.ndarray  # float64, (n_pairs, d + 3, n_numbers + 1); (n_pairs, 0, 1) without a prior
-    nearest: np.ndarray  # int32, (n_pairs,): the nearest of the instances of the own fit
+    item: np.ndarray  # int32, (n_pairs, n_neighbors): the instances it was fitted to; (n_pairs, 0) without a prior
 
     @classmethod
-    def empty(cls, n_pairs: int, reach: float, fitted: tuple[int, int], takes_prior: bool) -> "PairArrays":
+    def empty(cls, n_pairs: int, reach: float, fitted: tuple[int, int], n_kept: int) -> "PairArrays":
         """Pairs none of which has been fitted; ``fitted``: (d + 1, n_numbers), or (0, 0) for a model without fits."""
-        own = (fitted[0] + 2, fitted[1] + 1) if takes_prior else (0, 1)
         return cls(
             reach=np.full(n_pairs, reach),
             n_new=np.zeros(n_pairs, dtype=np.int32),
@@ -43,8 +40,7 @@ class PairArrays(NamedTuple):
             known=np.zeros(n_pairs, dtype=np.bool_),
             surprise=np.zeros(n_pairs),
             fit=np.zeros((n_pairs, *fitted)),
-            own_fit=np.zeros((n_pairs, *own)),
-            nearest=np.zeros(n_pairs, dtype=np.int32),
+            item=np.zeros((n_pairs, n_kept), dtype=np.int32),
         )
 
 

@@ -9,6 +9,7 @@ from sb3_combrel.common.constants import MAX_MODEL_STEPS
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.kernels import any_periodic, nearest_instances, squared_distance
 from sb3_combrel.common.regression import (
+    GROUP,
     Kernel,
     LocalFit,
     ends_by_action,
@@ -17,9 +18,10 @@ from sb3_combrel.common.regression import (
     known_weight,
     leverage_of,
     number_at,
+    write_residuals,
 )
 from sb3_combrel.common.transferred import TransferredInstances
-from sb3_combrel.models.ends import Ends, end_at, reach_of, squared_distance_of_end
+from sb3_combrel.models.ends import Ends, distance_of_nearest, end_at, reach_of, squared_distance_of_end
 from sb3_combrel.models.grid_model import add_to_row, total_weight
 from sb3_combrel.models.grid_points import PairArrays, note_fit
 from sb3_combrel.planning.grid import (
@@ -58,33 +60,77 @@ class LinearScratch(NamedTuple):
     prior: np.ndarray  # (2 * n_variables,): what a prior says at a state, between the grid points multilinear
 
 
+class Around(NamedTuple):
+    """What is known of arrivals and ends around the state of a fit."""
+
+    length: int  # instances of the fit
+    near: float  # how far the nearest of them has led
+    of_end: float  # how far the nearest end is; infinite without any
+    varies: float  # the mean square of the residuals of effects
+    most: float  # the largest residual
+
+
 @compiled
-def distances_around(at, action, experience, fit):
-    """How far ``at`` is from the nearest end, and from where the instance nearest to it has led."""
+def look_around(at, action, length, experience, kernel, fit):
+    """:class:`Around` of a state, before a prior joins the fit."""
     _, arrivals, ends = experience
+    of_end = squared_distance_of_end(at, ends, arrivals.periodic)
+    if of_end == np.inf:
+        return Around(length, 0.0, np.inf, 0.0, 0.0)
     near = squared_distance(at, arrivals.state[action, fit.item[0]], arrivals.periodic, True)
-    return np.sqrt(squared_distance_of_end(at, ends, arrivals.periodic)), np.sqrt(near)
+    varies, most = write_residuals(length, kernel, fit)
+    return Around(length, np.sqrt(near), np.sqrt(of_end), varies, np.sqrt(most))
 
 
 @compiled
 def outcome_of(fit, away, to, moved, around, experience, kernel, end):
     """Expected reward of a step from ``away`` of a fit's state to ``to``; writes to ``end`` the probability that it ends.
 
-    :param moved: how far ``to`` is from the fit's state, around which ``around`` are the :func:`distances_around`
+    :param moved: how far ``to`` is from the fit's state
     """
-    d = len(to)
-    reward = number_at(fit, d, away)
+    reward = number_at(fit, len(to), away)
     if ends_by_action(fit):
-        end[0] = number_at(fit, d + 1, away)
+        end[0] = number_at(fit, len(to) + 1, away)
         return reward
-    _, arrivals, ends = experience
-    of_end, near = around
     end[0], end[1] = 0.0, 0.0
     # Where even the nearest end there could be is too far to decide, none is searched for.
-    apart, arrived = max(of_end - moved, 0.0), (moved + near) ** 2
+    apart, arrived = max(around.of_end - moved - around.most, 0.0), (moved + around.near + around.most) ** 2
     if apart * apart <= reach_of(arrived, kernel.outcome_breadth):
-        end_at(to, arrived, kernel.outcome_breadth, arrivals, ends, end)
+        mean_end(fit, to, (moved + around.near) ** 2, around, experience, kernel, end)
     return (1.0 - end[0]) * reward + end[0] * end[1]
+
+
+@compiled
+def mean_end(fit, to, near, around, experience, kernel, end):
+    """Write to ``end`` what arriving at ``to`` means, or around it, as effects vary (see ``models.ends``).
+
+    Where residuals are larger, in their mean square, than the nearest arrival is far, each of them counts with the weight of
+    its instance.
+
+    :param near: squared distance of some arrival
+    """
+    _, arrivals, ends = experience
+    of_end = max(np.sqrt(squared_distance_of_end(to, ends, arrivals.periodic)) - around.most, 0.0)
+    if of_end * of_end > reach_of((np.sqrt(near) + around.most) ** 2, kernel.outcome_breadth):
+        return
+    nearest = distance_of_nearest(to, near, 0.0, kernel.outcome_breadth, arrivals, ends.hint)
+    if around.varies <= nearest:
+        end_at(to, nearest, kernel.outcome_breadth, arrivals, ends, end)
+        return
+    total, ended, paid = 0.0, 0.0, 0.0
+    for k in range(around.length):
+        square = 0.0
+        for v in range(len(to)):
+            square += fit.residual[k, v] * fit.residual[k, v]
+            to[v] += fit.residual[k, v]
+        end_at(to, (np.sqrt(nearest) + np.sqrt(square)) ** 2, kernel.outcome_breadth, arrivals, ends, end)
+        for v in range(len(to)):
+            to[v] -= fit.residual[k, v]
+        weight = fit.weighted[0, k // GROUP, k % GROUP]
+        total += weight
+        ended += weight * end[0]
+        paid += weight * end[0] * end[1]
+    end[0], end[1] = ended / total, paid / ended if ended > 0.0 else 0.0
 
 
 @entry_point
@@ -120,6 +166,7 @@ def predict_own(experience, linear, grid, has_prior, state, kernel, threshold, f
         if length == 0:
             continue
         fit_around(state, action, length, instances, kernel, fit)
+        around = look_around(state, action, length, experience, kernel, fit)
         if has_prior:
             # Finer effects would be confirmed by instances at a wall, but not at the grid points beside, which lead through.
             first = action * grid.shape[0] * grid.strides[0]
@@ -135,7 +182,6 @@ def predict_own(experience, linear, grid, has_prior, state, kernel, threshold, f
             prediction.effect[action, 0, v] = effect
             scratch.to[v] = state[v] + effect
             moved += effect * effect
-        around = distances_around(state, action, experience, fit)
         reward = outcome_of(fit, scratch.away, scratch.to, np.sqrt(moved), around, experience, kernel, scratch.end)
         end = scratch.end[0]
         prediction.reward[action], prediction.length[action] = reward, 1 if end < 1.0 else 0
@@ -182,7 +228,7 @@ def take_step(fit, grid, at, scratch):
 
 
 @inlined
-def follow(action, experience, kernel, fit, grid, at, planned, scratch):
+def follow(fit, around, experience, kernel, grid, at, planned, scratch):
     """Follow a fit around a grid point, the action held, until a variable has changed by a cell, or the episode ends.
 
     :param at: grid coordinates of the point; ``planned``: (gamma, most steps)
@@ -193,7 +239,6 @@ def follow(action, experience, kernel, fit, grid, at, planned, scratch):
     away = scratch.away
     away[:] = 0.0
     total, goes_on, discount = 0.0, 1.0, 1.0
-    around = distances_around(scratch.at, action, experience, fit)
     for n in range(max_steps):
         inside = take_step(fit, grid, at, scratch)
         moved = 0.0
@@ -217,31 +262,13 @@ def follow(action, experience, kernel, fit, grid, at, planned, scratch):
 
 
 @inlined
-def keep_own_fit(pair, pairs, fit):
-    """Keep a fit that a prior has not joined yet, for :func:`recall_own_fit`."""
-    kept, (n, columns) = pairs.own_fit[pair], fit.solution.shape
-    for p in range(n):
-        for v in range(columns):
-            kept[p, v] = fit.solution[p, v]
-    for v in range(len(fit.low)):
-        kept[n, v], kept[n + 1, v] = fit.low[v], fit.high[v]
-    pairs.nearest[pair] = fit.item[0]
-
-
-@inlined
-def recall_own_fit(pair, at, action, instances, pairs, fit):
-    """Put back what :func:`keep_own_fit` has kept, while no other instances are near the pair."""
-    kept, (n, columns) = pairs.own_fit[pair], fit.solution.shape
-    for p in range(n):
-        for v in range(columns):
-            fit.solution[p, v] = kept[p, v]
-    for v in range(len(fit.low)):
-        fit.low[v], fit.high[v] = kept[n, v], kept[n + 1, v]
-    fit.item[0] = pairs.nearest[pair]
+def recall_instances(pair, at, action, instances, pairs, fit):
+    """Write the instances that a pair was fitted to, and their distances; how many these are."""
     wraps = any_periodic(instances.periodic)
-    # Of distances the first and the last are used, and the last one of a full list alone.
-    fit.distance[pairs.length[pair] - 1] = pairs.reach[pair]
-    fit.distance[0] = squared_distance(at, instances.state[action, fit.item[0]], instances.periodic, wraps)
+    for k in range(pairs.length[pair]):
+        fit.item[k] = pairs.item[pair, k]
+        fit.distance[k] = squared_distance(at, instances.state[action, fit.item[k]], instances.periodic, wraps)
+    return pairs.length[pair]
 
 
 @entry_point
@@ -265,9 +292,9 @@ def update_rows(experience, linear, pairs, mdp, grid, kernel, planned, which, tr
         action = pair // n_points
         coordinates_of(point, grid, row_scratch.at)
         unit_coordinates_of(row_scratch.at, grid, scratch.at)
-        length, weight = pairs.length[pair], pairs.weight[pair]
-        kept = has_prior and pairs.known[pair] and pairs.n_new[pair] == 0 and length > 0
-        if not kept:
+        if has_prior and pairs.known[pair] and pairs.n_new[pair] == 0 and pairs.length[pair] > 0:
+            length, weight = recall_instances(pair, scratch.at, action, instances, pairs, fit), pairs.weight[pair]
+        else:
             # Instances only come nearer, but for those that are removed (see grid_points.look_at).
             length = nearest_instances(instances, action, scratch.at, pairs.reach[pair], fit.item, fit.distance)
             weight = known_weight(fit, length, kernel)
@@ -278,18 +305,17 @@ def update_rows(experience, linear, pairs, mdp, grid, kernel, planned, which, tr
             total = total_weight(weight, transferred, done) if joined else weight
             reward, discount, n_touched = 0.0, gamma, np.int64(0)
             if length > 0:
-                if kept:
-                    recall_own_fit(pair, scratch.at, action, instances, pairs, fit)
-                else:
-                    fit_around(scratch.at, action, length, instances, kernel, fit)
+                fit_around(scratch.at, action, length, instances, kernel, fit)
+                around = look_around(scratch.at, action, length, experience, kernel, fit)
                 if has_prior:
-                    keep_own_fit(pair, pairs, fit)
+                    for k in range(length):
+                        pairs.item[pair, k] = fit.item[k]
                     join_prior(linear.prior[pair], kernel, length, fit)
                 for p in range(pairs.fit.shape[1]):
                     for v in range(pairs.fit.shape[2]):
                         pairs.fit[pair, p, v] = fit.solution[p, v]
                 how = gamma, 1 if joined else MAX_MODEL_STEPS
-                reward, goes_on, discount = follow(action, experience, kernel, fit, grid, row_scratch.at, how, scratch)
+                reward, goes_on, discount = follow(fit, around, experience, kernel, grid, row_scratch.at, how, scratch)
                 if goes_on < 1.0:
                     # Near an end every arrival matters.
                     pairs.surprise[pair] = np.inf

@@ -65,6 +65,7 @@ class Fit:
         # In instances at the state; that of the nearest alone bounds it, by the broad kernel.
         sure = min(leverage * math.exp(squared[0] / breadth**2), math.exp(squared[0] / broad**2))
         self.design, self.penalty, self.weights, self.effects, self.sure = design, penalty, weights, numbers[:, :d], sure
+        self.residuals = numbers[:, :d] - self.mean[:d] - away @ self.slopes[:, :d]
         for v in np.flatnonzero(prior[1]):
             # An instance of such a weight moves the mean to that of the prior and of own instances worth 1 / sure.
             pull = prior[1][v] / (prior[1][v] + 1.0 / sure)
@@ -164,15 +165,26 @@ class NaiveLocalLinear:
         rewards = np.array([i.reward for i in arrivals])
         return weights[ended].sum() / weights.sum(), np.average(rewards[ended], weights=weights[ended])
 
-    def outcome(self, at, away, numbers, now):
+    def mean_end(self, fit, at, now):
+        """The same where effects vary: the mean over the residuals, if these are larger than the nearest arrival is far."""
+        arrivals = [i for action in range(self.n_actions) for i in self.present(action, now)]
+        nearest = min(self.squared(at, i.state + i.effect) for i in arrivals)
+        if np.average((fit.residuals**2).sum(axis=1), weights=fit.weights) <= nearest:
+            return self.end_at(at, now)
+        ends, pays = np.array([self.end_at(at + residual, now) for residual in fit.residuals]).T
+        weights = fit.weights * ends
+        return np.average(ends, weights=fit.weights), np.average(pays, weights=weights) if weights.any() else 0.0
+
+    def outcome(self, fit, at, away, numbers, now):
         """Reward and probability of the end of a step from ``at`` that leads ``away`` from there.
 
+        :param fit: around ``at``; None without instances
         :param numbers: what is fitted of it besides the effect
         """
         if self.ends_by_action:
             return tuple(numbers)
         [reward] = numbers
-        end, pays = self.end_at(at + away, now)
+        end, pays = self.end_at(at + away, now) if fit is None else self.mean_end(fit, at + away, now)
         return (1.0 - end) * reward + end * pays, end
 
     def at_state(self, state, action):
@@ -182,7 +194,7 @@ class NaiveLocalLinear:
         if fit is not None:
             numbers = fit.at(np.zeros(self.d))
         effect = numbers[: self.d]
-        return Predicted(effect, *self.outcome(state, effect, numbers[self.d :], self.now), weight)
+        return Predicted(effect, *self.outcome(fit, state, effect, numbers[self.d :], self.now), weight)
 
     def weight_of(self, action, point, now):
         return self.fitted(self.points[point], action, now)[1]
@@ -203,7 +215,7 @@ class NaiveLocalLinear:
             edge = self.edges(point, after)
             beyond = np.abs(after) > np.abs(edge)
             part = min([1.0, *((edge - away)[beyond] / (after - away)[beyond])])
-            reward, end = self.outcome(at, after, numbers[self.d :], now)
+            reward, end = self.outcome(fit, at, after, numbers[self.d :], now)
             taken = 1.0 if n == 0 or end > 0.0 or stays else part
             total += discount * goes_on * taken * reward
             goes_on *= 1.0 - end

@@ -86,7 +86,7 @@ def test_a_new_prior_joins_fits_that_were_kept_as_it_joins_those_made_anew(max_i
     for model in models:
         renew(model, model._prior)
         model.update_rows(outdated)
-    assert (kept.pairs.own_fit[outdated] != 0.0).any()
+    assert (kept.pairs.item[outdated] != 0).any()
     linear_models.assert_same_to_the_last_bit(kept, anew)
 
 
