@@ -102,10 +102,7 @@ def outcome_of(fit, away, to, moved, around, experience, kernel, end):
 
 @compiled
 def mean_end(fit, to, near, around, experience, kernel, end):
-    """Write to ``end`` what arriving at ``to`` means, or around it, as effects vary (see ``models.ends``).
-
-    Where residuals are larger, in their mean square, than the nearest arrival is far, each of them counts with the weight of
-    its instance.
+    """Write to ``end`` what arriving at ``to`` means, or, as effects vary, around it (see ``models.ends``).
 
     :param near: squared distance of some arrival
     """

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from helpers.agents import assert_same_state, make_agent
 from helpers.own_method import Mine
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
 
 from sb3_combrel import FittedRMax
 from sb3_combrel.planning.q_values import ValueFunction
@@ -103,3 +105,26 @@ def test_the_space_says_whether_variables_have_bounds(name, is_bounded):
     assert FittedRMax(env).agent.task.is_bounded is is_bounded
     low, high = np.full(env.observation_space.shape, -5.0), np.full(env.observation_space.shape, 5.0)
     assert FittedRMax(env, bounds=(low, high)).agent.task.is_bounded, "the user gives some"
+
+
+class BetweenEdges(gym.Env):
+    """Steps of 0.05 to either side, with noise; each pays 1, and beyond 0.1 and 0.9 an episode ends."""
+
+    observation_space, action_space = gym.spaces.Box(0.0, 1.0, (1,)), gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.at, self.n = self.np_random.uniform(0.4, 0.6), 0
+        return np.float32([self.at]), {}
+
+    def step(self, action):
+        self.at = float(np.clip(self.at + 0.05 * (2 * action - 1) + 0.02 * self.np_random.normal(), 0.0, 1.0))
+        self.n += 1
+        return np.float32([self.at]), 1.0, not 0.1 < self.at < 0.9, self.n >= 200, {}
+
+
+def test_a_frozen_policy_keeps_away_from_an_edge_where_noise_ends_episodes():
+    model = FittedRMax(BetweenEdges(), seed=0).learn(1000)
+    mean, _ = evaluate_policy(model, Monitor(BetweenEdges()), n_eval_episodes=20)
+    # Random actions live 70 steps.
+    assert mean > 140.0

@@ -6,6 +6,7 @@ from helpers import linear_models
 from helpers.kernel_models import N_ACTIONS, random_transitions
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
 from sb3_combrel.common.compiled import compiled
 from sb3_combrel.models.ends import end_at
@@ -108,6 +109,39 @@ def test_ends_on_the_other_side_of_an_origin_are_near():
     for state, ended in ((0.0, 1.0), (0.01, 1.0), (1.01, 1.0), (0.02, 1.0), (0.55, 0.0)):
         assert found_at(model, np.array([state]))[0] == pytest.approx(ended, abs=1e-6)
         assert naive.end_at(np.array([state]), naive.now)[0] == pytest.approx(ended, abs=1e-6)
+
+
+def noisy_line_model(noise, n=300):
+    """Steps of 0.05 to the right, with noise; those that arrive beyond 0.75 end the episode."""
+    model, naive = linear_models.linear_model_and_definition(((4,), 1), KERNEL | dict(n_neighbors=20), gamma=0.9)
+    rng = np.random.default_rng(0)
+    for at in rng.uniform(0.0, 0.75, n):
+        to = at + 0.05 + noise * rng.normal()
+        transition = np.array([at]), 0, 7.0 if to > 0.75 else -1.0, np.array([to]), bool(to > 0.75)
+        model.add(*transition)
+        naive.add(*transition)
+    return model, naive
+
+
+def test_near_an_edge_noise_ends_as_many_episodes_as_it_does():
+    noise = 0.02
+    model, naive = noisy_line_model(noise)
+    errors = []
+    for at in np.linspace(0.66, 0.74, 30):
+        prediction = model.predict_at(np.array([at]))[0]
+        end = 1.0 - prediction.probability[0, 0] if prediction.length[0] else 1.0
+        errors.append(end - stats.norm.cdf((at + 0.05 - 0.75) / noise))
+        linear_models.assert_same_prediction(model, naive, np.array([at]))
+    assert abs(np.mean(errors)) < 0.05 and np.abs(errors).max() < 0.25
+    assert model.predict_at(np.array([0.6]))[0].probability[0, 0] == 1.0
+
+
+def test_without_noise_an_end_is_judged_where_the_mean_effect_leads():
+    model, naive = noisy_line_model(0.0)
+    ends = [model.predict_at(np.array([at]))[0].length[0] == 0 for at in (0.6, 0.68, 0.69, 0.71, 0.72, 0.74)]
+    assert ends == [False] * 3 + [True] * 3
+    model.update_all(np.arange(len(model.known)))
+    assert linear_models.assert_same_rows(model, naive) > 0
 
 
 @pytest.mark.parametrize("outcome_breadth", [1e-3, 1e-2])
