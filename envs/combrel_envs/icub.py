@@ -90,6 +90,9 @@ def make_environment(
 class Physics(mujoco.Physics):
     """The robot, the table and the ball. The joints of the task come first in MuJoCo's arrays, then the ball's."""
 
+    #: Of the class, as a copy of a physics has nothing but its data.
+    legacy_step = False
+
     def _reload_from_data(self, data: wrapper.MjData) -> None:
         super()._reload_from_data(data)
         n = self.model.nu

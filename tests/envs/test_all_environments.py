@@ -1,5 +1,7 @@
 """What holds for every environment: conventions of Gymnasium and dm_control, limits, known plans, seeds and bad input."""
 
+import copy
+import pickle
 import warnings
 
 import gymnasium
@@ -63,6 +65,17 @@ class TestGymnasium:
         env.reset(seed=0)
         with pytest.raises(ValueError, match=rf"action must be an integer from 0 to {n - 1} \(.*, got"):
             env.step(action)
+
+
+@pytest.mark.parametrize("env_id", [*IDS, *NOISY.values()])
+def test_a_copy_in_mid_episode_goes_on_as_the_original(env_id):
+    env = gymnasium.make(env_id)
+    env.reset(seed=0)
+    for action in (1, 2, 0, 1):
+        env.step(action)
+    envs = [env, copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
+    ours, *theirs = [[each.step(action)[0].tolist() for action in (0, 1, 2, 2, 1, 1)] for each in envs]
+    assert [ours] * 2 == theirs
 
 
 def test_all_kinds_of_integers_are_actions():
