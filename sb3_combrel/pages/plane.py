@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from importlib.util import find_spec
 from typing import Any, NamedTuple
 
@@ -53,9 +53,17 @@ def planes_of(
 
     :raises ValueError: if they do not fit the task
     """
-    if at is not None and np.shape(at) != (len(names),):
-        raise ValueError(f"at must be {len(names)} numbers, one a state variable, got {at!r}")
+    if at is not None and not _is_state(at, len(names)):
+        raise ValueError(f"at must be {len(names)} finite numbers, one a state variable, got {at!r}")
     return [plane_through(grid, scaling, names, pair, at) for pair in numbered(variables, names)]
+
+
+def _is_state(at: ArrayLike, n_variables: int) -> bool:
+    try:
+        state = np.asarray(at, dtype=np.float64)
+    except (TypeError, ValueError):
+        return False
+    return state.shape == (n_variables,) and bool(np.isfinite(state).all())
 
 
 def plane_through(
@@ -118,9 +126,10 @@ def numbered(variables: Sequence[VariablePair] | None, names: Sequence[str]) -> 
         return [default_pair(names)]
     number: dict[Any, int] = {**{name: k for k, name in enumerate(names)}, **{k: k for k in range(len(names))}}
     pairs = []
-    for pair in variables:
-        given = [] if isinstance(pair, str) else list(pair)
-        found = tuple(number.get(each, -1) for each in given)
+    # No pair at all is refused like a wrong one.
+    for pair in variables if isinstance(variables, Sequence | np.ndarray) and len(variables) else [variables]:
+        given = list(pair) if isinstance(pair, Sequence | np.ndarray) and not isinstance(pair, str) else []
+        found = tuple(number.get(each, -1) if isinstance(each, Hashable) else -1 for each in given)
         if len(found) != 2 or -1 in found or (found[0] == found[1] and len(names) > 1):
             raise ValueError(
                 f"variables must be pairs of two different state variables, by numbers below {len(names)} or names out of "

@@ -214,8 +214,12 @@ def test_what_cannot_be_explained_is_refused(saved, transfers, tmp_path):
     (tmp_path / "text.zip").write_text("mine")
     with pytest.raises(ValueError, match=r"text.zip is not the file of a model"):
         explain(tmp_path / "text.zip")
-    with pytest.raises(ValueError, match=r"at must be 2 numbers, one a state variable, got \[1\]"):
-        explain(saved[0], tmp_path, at=[1])
+    for at in ([1], [np.nan, 1.0], ["place", "height"]):
+        with pytest.raises(ValueError, match="at must be 2 finite numbers, one a state variable, got"):
+            explain(saved[0], tmp_path, at=at)
+    for variables in ([], (0, 1), 0, [(["place"], "height")]):
+        with pytest.raises(ValueError, match="variables must be pairs of two different state variables, .* got"):
+            explain(saved[0], tmp_path, variables=variables)
     with pytest.raises(ValueError, match=r"names out of place, height, .* got \('place', 'width'\)"):
         explain(saved[0], tmp_path, variables=[("place", "width")])
     with pytest.raises(ValueError, match=r"got \('place', 'heigth'\); did you mean 'height'\?"):
