@@ -139,8 +139,7 @@ def explain(model: Path, /, output: Path | None = None, variables: tuple[str, st
     report = run(model, output, None if variables is None else [variables])
     print(report)
     if output is not None:
-        names = ("report.html", "*.png", "mappings.md", "report.txt")
-        print("\nWritten:", *(file for name in names for file in sorted(output.glob(name))), sep="\n  ")
+        print(f"\nWritten into {output}; to look at: {output / 'report.html'}")
 
 
 def benchmark(

@@ -233,9 +233,10 @@ def test_the_command_prints_the_report_and_writes_it_with_the_pictures(saved, tm
     model, path = saved
     text = str(model.transfer.report())
     assert call_for_all_output("explain", path) == (0, f"{text}\n")
+    (tmp_path / "mine.png").touch()
     status, written = call_for_all_output("explain", path, "--output", tmp_path)
     assert status == 0 and written.startswith(text) and (tmp_path / "report.txt").read_text() == f"{text}\n"
-    assert all(str(file) in written for file in tmp_path.iterdir()) and len(list(tmp_path.glob("*.png"))) == 2
+    assert str(tmp_path / "report.html") in written and "mine.png" not in written and len(list(tmp_path.glob("*.png"))) == 3
     status, written = call_for_all_output("explain", tmp_path / "nowhere.zip")
     assert status == 1 and "there is no model file" in written and "Traceback" not in written
 
