@@ -65,20 +65,20 @@ def value_figure(snapshot: Snapshot, plane: Plane, width: float) -> Figure:
     return figure
 
 
-def returns_figure(steps: np.ndarray, returns: np.ndarray, width: float) -> Figure:
+def returns_figure(ends: np.ndarray, returns: np.ndarray, unit: str, width: float) -> Figure:
     """Draw the returns of the episodes of one run, and their running mean over ten.
 
-    :param steps: environment steps at which each episode ended, shape (n_episodes,); ``returns``: of each
+    :param ends: at which each episode ended, in ``unit``, such as environment steps, shape (n_episodes,); ``returns``: of each
     """
     figure = figure_of(width, 2.8)
     axes = figure.subplots()
-    axes.plot(steps, returns, ".", color=MAPPING_COLOURS[0], alpha=0.45, label="an episode", markersize=5)
+    axes.plot(ends, returns, ".", color=MAPPING_COLOURS[0], alpha=0.45, label="an episode", markersize=5)
     window = min(10, len(returns) // 2)
     if window > 1:
         mean = np.convolve(returns, np.ones(window) / window, mode="valid")
-        axes.plot(steps[window - 1 :], mean, color=MAPPING_COLOURS[0], linewidth=1.8, label=f"mean of {window}")
+        axes.plot(ends[window - 1 :], mean, color=MAPPING_COLOURS[0], linewidth=1.8, label=f"mean of {window}")
     label_axes(axes, "return of the episodes", "return")
-    axes.set_xlabel("environment steps", fontsize=FONT_SIZE)
+    axes.set_xlabel(unit, fontsize=FONT_SIZE)
     axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
     axes.legend(fontsize=FONT_SIZE - 1, frameon=False)
     return figure

@@ -64,12 +64,15 @@ def _returns(model: FittedRMax) -> Section:
     lengths = np.array([info["l"] for info in episodes], dtype=np.float64)
     returns = np.array([info["r"] for info in episodes], dtype=np.float64)
     is_all = len(episodes) >= model._episode_num
+    # Of several environments it is not kept when which one's episode ended: they are counted instead of their steps.
+    unit, each, total = "environment steps", lengths, model.num_timesteps
+    if model.n_envs > 1:
+        unit, each, total = "episodes", np.ones_like(lengths), model._episode_num
     # What came before, if the buffer does not hold all episodes; steps after the last end are not counted.
-    before = 0.0 if is_all else max(0.0, model.num_timesteps - lengths.sum())
-    steps = before + np.cumsum(lengths)
+    ends = (0.0 if is_all else max(0.0, total - each.sum())) + np.cumsum(each)
     shown = f"All {len(episodes)} episodes." if is_all else f"The last {len(episodes)} episodes: the model keeps no more."
     text = f"{shown} The mean return of the last {min(10, len(returns))} is {returns[-10:].mean():.4g}."
-    return Section(title, [text], [picture(partial(returns_figure, steps, returns), "Return of each episode over steps")])
+    return Section(title, [text], [picture(partial(returns_figure, ends, returns, unit), f"Return of each episode over {unit}")])
 
 
 def _evidence(model: FittedRMax, report: TransferReport) -> Section:

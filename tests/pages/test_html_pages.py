@@ -4,10 +4,13 @@ import base64
 import re
 from dataclasses import replace
 
+import gymnasium
 import numpy as np
 import pytest
 from helpers.command_line import call_for_all_output
+from helpers.dashboard import Still, walker
 from matplotlib.colors import to_hex
+from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_combrel import FittedRMax, explain
 from sb3_combrel.common.files import check_folder
@@ -58,6 +61,18 @@ def test_pages_of_other_models_say_what_they_do_not_have(models, tmp_path, undra
     explain(models["none"], tmp_path / "none")
     html = (tmp_path / "none" / "report.html").read_text()
     assert titles(html) == ["Learning curve", "Values and policy"] and "no transfer method" in html
+
+
+@pytest.mark.parametrize(("n_envs", "unit", "ends"), [(1, "environment steps", [25, 50]), (3, "episodes", [1, 2, 3])])
+def test_learning_curves_are_over_steps_or_over_the_episodes_of_several_environments(
+    n_envs, unit, ends, monkeypatch, tmp_path, undrawn
+):
+    drawn = []
+    monkeypatch.setattr("sb3_combrel.pages.drawings.returns_figure", lambda *given: drawn.append(given))
+    env = make_vec_env(lambda: gymnasium.wrappers.TimeLimit(Still(np.float32([0]), np.float32([1])), 25), n_envs)
+    explain(walker(env=env).learn(60 if n_envs == 1 else 30 * n_envs), tmp_path)
+    assert drawn[0][2] == unit and drawn[0][0].tolist() == ends
+    assert f"Return of each episode over {unit}" in (tmp_path / "report.html").read_text()
 
 
 def test_the_same_model_gives_the_same_bytes(models, tmp_path):
