@@ -54,6 +54,12 @@ def open_gl(physics: Any) -> None:
         try:
             _ = physics.contexts
         except Exception as error:
+            # Smaller pictures can be drawn in this process.
+            if "framebuffer is not complete" in str(error):
+                size = physics.model.vis.global_
+                raise RenderingError(
+                    f"width and height must be smaller: {size.offwidth} x {size.offheight} pixels are too many here ({error})"
+                ) from error
             _failure = error
     if _failure is not None:
         raise RenderingError(_ADVICE.format(gl=os.environ.get("MUJOCO_GL"), reason=_failure)) from _failure

@@ -339,6 +339,17 @@ def test_record_video_writes_a_film(tmp_path):
     assert len(films) == 1 and films[0].stat().st_size > 500
 
 
+# Of the context that MuJoCo could not make.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_picture_that_is_too_large_says_so_and_smaller_ones_are_drawn_afterwards():
+    envs = [gymnasium.make(TORSO, render_mode="rgb_array", width=width, height=48) for width in (200_000, 64)]
+    for env in envs:
+        env.reset()
+    with pytest.raises(combrel_envs.RenderingError, match="width and height must be smaller: 200000 x 960 pixels are too many"):
+        envs[0].render()
+    assert envs[1].render().shape == (48, 64, 3)
+
+
 def run(code, **variables):
     """What a Python process prints."""
     environ = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), **variables}
