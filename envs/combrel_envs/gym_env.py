@@ -119,8 +119,7 @@ class DmControlEnv(RenderedEnv):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin an episode; ``seed`` is that of the following ones too. For ``options`` see :meth:`_apply_options`."""
-        if self._closed:
-            raise ClosedEnvironmentError("reset() must come before close(), which has freed the simulation: make a new one")
+        self._check_open("reset")
         super().reset(seed=seed)
         if seed is not None:
             self._environment.task.random.seed(int(self.np_random.integers(2**32)))
@@ -148,7 +147,12 @@ class DmControlEnv(RenderedEnv):
             self._environment.close()
             self._environment.physics.free()
 
+    def _check_open(self, call: str) -> None:
+        if self._closed:
+            raise ClosedEnvironmentError(f"{call}() must come before close(), which has freed the simulation: make a new one")
+
     def _drawn_physics(self) -> "mujoco.Physics":
+        self._check_open("render")
         return self._environment.physics
 
     def _apply_options(self, options: dict[str, Any]) -> None:

@@ -165,8 +165,9 @@ class TestOptions:
             env.reset(options=options)
         np.testing.assert_allclose(env.reset()[0], STARTS[TORSO], atol=1e-5)
 
-    def test_a_reset_after_close_says_so(self):
-        env = gymnasium.make(TORSO)
+    @pytest.mark.parametrize("call", ["reset", "render"])
+    def test_a_call_after_close_says_so(self, call):
+        env = gymnasium.make(TORSO, render_mode="rgb_array").unwrapped
         env.close()
-        with pytest.raises(ClosedEnvironmentError, match=r"reset\(\) must come before close\(\)"):
-            env.reset()
+        with pytest.raises(ClosedEnvironmentError, match=rf"{call}\(\) must come before close\(\)"):
+            getattr(env, call)()
