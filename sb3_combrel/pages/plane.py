@@ -128,7 +128,7 @@ def numbered(variables: Sequence[VariablePair] | None, names: Sequence[str]) -> 
     pairs = []
     # No pair at all is refused like a wrong one.
     for pair in variables if isinstance(variables, Sequence | np.ndarray) and len(variables) else [variables]:
-        given = list(pair) if isinstance(pair, Sequence | np.ndarray) and not isinstance(pair, str) else []
+        given: list[Any] = list(pair) if isinstance(pair, Sequence | np.ndarray) and not isinstance(pair, str) else []
         found = tuple(number.get(each, -1) if isinstance(each, Hashable) else -1 for each in given)
         if len(found) != 2 or -1 in found or (found[0] == found[1] and len(names) > 1):
             raise ValueError(

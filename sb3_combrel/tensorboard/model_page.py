@@ -72,7 +72,8 @@ def _returns(model: FittedRMax) -> Section:
     ends = (0.0 if is_all else max(0.0, total - each.sum())) + np.cumsum(each)
     shown = f"All {len(episodes)} episodes." if is_all else f"The last {len(episodes)} episodes: the model keeps no more."
     text = f"{shown} The mean return of the last {min(10, len(returns))} is {returns[-10:].mean():.4g}."
-    return Section(title, [text], [picture(partial(returns_figure, ends, returns, unit), f"Return of each episode over {unit}")])
+    draw = partial(returns_figure, ends, returns, unit)
+    return Section(title, [text], [picture(draw, f"Return of each episode over {unit}")])
 
 
 def _evidence(model: FittedRMax, report: TransferReport) -> Section:

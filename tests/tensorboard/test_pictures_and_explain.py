@@ -218,7 +218,7 @@ def test_what_cannot_be_explained_is_refused(saved, transfers, tmp_path):
         with pytest.raises(ValueError, match="at must be 2 finite numbers, one a state variable, got"):
             explain(saved[0], tmp_path, at=at)
     for variables in ([], (0, 1), 0, [(["place"], "height")]):
-        with pytest.raises(ValueError, match="variables must be pairs of two different state variables, .* got"):
+        with pytest.raises(ValueError, match=r"variables must be pairs of two different state variables, .* got"):
             explain(saved[0], tmp_path, variables=variables)
     with pytest.raises(ValueError, match=r"names out of place, height, .* got \('place', 'width'\)"):
         explain(saved[0], tmp_path, variables=[("place", "width")])
