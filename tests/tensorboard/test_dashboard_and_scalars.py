@@ -149,7 +149,7 @@ def test_the_dashboard_shows_environments_in_other_processes(transfers, tmp_path
         (dict(variables=[("place", "place")]), "two different"),
         (dict(variables=[("place", "speed")]), "place, height"),
         (dict(variables=[(0, 2)]), "below 2"),
-        (dict(at=[0.0]), "at must be 2 numbers"),
+        (dict(at=[0.0]), "at must be 2 finite numbers"),
     ],
 )
 def test_variables_and_states_that_do_not_fit_the_task_are_refused(wrong, message, tmp_path):
