@@ -48,8 +48,9 @@ class LocalFit(NamedTuple):
     z: np.ndarray
     weighted: np.ndarray
     number: np.ndarray  # its numbers, float64, (n_numbers, groups, GROUP)
-    # By how much the effects of instances differ from what is fitted of them, float64, (n_neighbors, d).
+    # By how much effects of instances differ from what is fitted of them; what of that is noise; float64, (n_neighbors, d).
     residual: np.ndarray
+    noise: np.ndarray
 
     @classmethod
     def empty(cls, n_neighbors: int, n_variables: int, ends_by_action: bool = False) -> "LocalFit":
@@ -67,6 +68,7 @@ class LocalFit(NamedTuple):
             weighted=np.empty((d + 1, *groups)),
             number=np.empty((n_numbers, *groups)),
             residual=np.zeros((n_neighbors, d)),
+            noise=np.zeros((n_neighbors, d)),
         )
 
 
@@ -203,23 +205,49 @@ def fit_around(at, action, length, instances, kernel, fit):
 
 @compiled
 def write_residuals(length, kernel, fit):
-    """Write the residuals of the effects; the weighted mean of their squared lengths, and the largest of these."""
+    """Write by how much the effects of instances differ from what is fitted of them; the largest squared length of these."""
     d = fit.residual.shape[1]
     per_unit = np.sqrt(-kernel_scale(fit, length, kernel))
-    total, sum_of_squares, largest = 0.0, 0.0, 0.0
+    largest = 0.0
     for k in range(length):
-        g, lane = k // GROUP, k % GROUP
         square = 0.0
         for v in range(d):
-            residual = fit.number[v, g, lane] - fit.solution[0, v]
+            residual = fit.number[v, k // GROUP, k % GROUP] - fit.solution[0, v]
             for j in range(d):
-                residual -= fit.solution[j + 1, v] * fit.z[j + 1, g, lane] / per_unit
+                residual -= fit.solution[j + 1, v] * fit.z[j + 1, k // GROUP, k % GROUP] / per_unit
             fit.residual[k, v] = residual
             square += residual * residual
-        total += fit.weighted[0, g, lane]
-        sum_of_squares += fit.weighted[0, g, lane] * square
         largest = max(largest, square)
-    return sum_of_squares / total, largest
+    return largest
+
+
+@compiled
+def write_noise(length, fit):
+    """Write by how much residuals differ from those of the instance that is nearest to each, in parts of the root of 2.
+
+    Where a line fits badly, as at a wall, residuals are large, and nearly the same beside each other; noise is not (Rice 1984).
+
+    :return: the weighted mean of the squared lengths
+    """
+    d = fit.residual.shape[1]
+    total, sum_of_squares = 0.0, 0.0
+    for k in range(length):
+        nearest, least = k, np.inf
+        for i in range(length):
+            apart = 0.0
+            for j in range(1, d + 1):
+                along = fit.z[j, i // GROUP, i % GROUP] - fit.z[j, k // GROUP, k % GROUP]
+                apart += along * along
+            if i != k and apart < least:
+                nearest, least = i, apart
+        square = 0.0
+        for v in range(d):
+            fit.noise[k, v] = (fit.residual[k, v] - fit.residual[nearest, v]) * np.sqrt(0.5)
+            square += fit.noise[k, v] * fit.noise[k, v]
+        weight = fit.weighted[0, k // GROUP, k % GROUP]
+        total += weight
+        sum_of_squares += weight * square
+    return sum_of_squares / total
 
 
 @inlined

@@ -4,8 +4,8 @@ Of the arrivals near a state the nearest decide, with weights exp(-(q - q_min) /
 breadth b is no more than ``outcome_breadth`` and no more than the nearest arrival is far, so one that was made before decides
 for itself. Beyond an edge at which episodes end the nearest arrivals are ends, so states there count as ended.
 
-Where effects have noise, the mean effect alone does not say where one arrives. If the residuals of the instances around a
-state are larger, in their mean square, than the nearest arrival is far, the mean over where each of them would lead counts.
+Where effects have noise, the mean effect alone does not say where one arrives. If the noise around a state is larger, in its
+mean square, than the nearest arrival is far, the mean over where the noise of each instance would lead counts.
 """
 
 from typing import NamedTuple

@@ -18,6 +18,7 @@ from sb3_combrel.common.regression import (
     known_weight,
     leverage_of,
     number_at,
+    write_noise,
     write_residuals,
 )
 from sb3_combrel.common.transferred import TransferredInstances
@@ -66,8 +67,7 @@ class Around(NamedTuple):
     length: int  # instances of the fit
     near: float  # how far the nearest of them has led
     of_end: float  # how far the nearest end is; infinite without any
-    varies: float  # the mean square of the residuals of effects
-    most: float  # the largest residual
+    noise: float  # no noise of an effect is larger
 
 
 @compiled
@@ -76,10 +76,9 @@ def look_around(at, action, length, experience, kernel, fit):
     _, arrivals, ends = experience
     of_end = squared_distance_of_end(at, ends, arrivals.periodic)
     if of_end == np.inf:
-        return Around(length, 0.0, np.inf, 0.0, 0.0)
+        return Around(length, 0.0, np.inf, 0.0)
     near = squared_distance(at, arrivals.state[action, fit.item[0]], arrivals.periodic, True)
-    varies, most = write_residuals(length, kernel, fit)
-    return Around(length, np.sqrt(near), np.sqrt(of_end), varies, np.sqrt(most))
+    return Around(length, np.sqrt(near), np.sqrt(of_end), np.sqrt(2.0 * write_residuals(length, kernel, fit)))
 
 
 @compiled
@@ -94,7 +93,7 @@ def outcome_of(fit, away, to, moved, around, experience, kernel, end):
         return reward
     end[0], end[1] = 0.0, 0.0
     # Where even the nearest end there could be is too far to decide, none is searched for.
-    apart, arrived = max(around.of_end - moved - around.most, 0.0), (moved + around.near + around.most) ** 2
+    apart, arrived = max(around.of_end - moved - around.noise, 0.0), (moved + around.near + around.noise) ** 2
     if apart * apart <= reach_of(arrived, kernel.outcome_breadth):
         mean_end(fit, to, (moved + around.near) ** 2, around, experience, kernel, end)
     return (1.0 - end[0]) * reward + end[0] * end[1]
@@ -102,27 +101,27 @@ def outcome_of(fit, away, to, moved, around, experience, kernel, end):
 
 @compiled
 def mean_end(fit, to, near, around, experience, kernel, end):
-    """Write to ``end`` what arriving at ``to`` means, or, as effects vary, around it (see ``models.ends``).
+    """Write to ``end`` what arriving at ``to`` means, or, with noise, around it (see ``models.ends``).
 
     :param near: squared distance of some arrival
     """
     _, arrivals, ends = experience
-    of_end = max(np.sqrt(squared_distance_of_end(to, ends, arrivals.periodic)) - around.most, 0.0)
-    if of_end * of_end > reach_of((np.sqrt(near) + around.most) ** 2, kernel.outcome_breadth):
+    of_end = max(np.sqrt(squared_distance_of_end(to, ends, arrivals.periodic)) - around.noise, 0.0)
+    if of_end * of_end > reach_of((np.sqrt(near) + around.noise) ** 2, kernel.outcome_breadth):
         return
     nearest = distance_of_nearest(to, near, 0.0, kernel.outcome_breadth, arrivals, ends.hint)
-    if around.varies <= nearest:
+    if write_noise(around.length, fit) <= nearest:
         end_at(to, nearest, kernel.outcome_breadth, arrivals, ends, end)
         return
     total, ended, paid = 0.0, 0.0, 0.0
     for k in range(around.length):
         square = 0.0
         for v in range(len(to)):
-            square += fit.residual[k, v] * fit.residual[k, v]
-            to[v] += fit.residual[k, v]
+            square += fit.noise[k, v] * fit.noise[k, v]
+            to[v] += fit.noise[k, v]
         end_at(to, (np.sqrt(nearest) + np.sqrt(square)) ** 2, kernel.outcome_breadth, arrivals, ends, end)
         for v in range(len(to)):
-            to[v] -= fit.residual[k, v]
+            to[v] -= fit.noise[k, v]
         weight = fit.weighted[0, k // GROUP, k % GROUP]
         total += weight
         ended += weight * end[0]

@@ -65,7 +65,10 @@ class Fit:
         # In instances at the state; that of the nearest alone bounds it, by the broad kernel.
         sure = min(leverage * math.exp(squared[0] / breadth**2), math.exp(squared[0] / broad**2))
         self.design, self.penalty, self.weights, self.effects, self.sure = design, penalty, weights, numbers[:, :d], sure
-        self.residuals = numbers[:, :d] - self.mean[:d] - away @ self.slopes[:, :d]
+        residuals = numbers[:, :d] - self.mean[:d] - away @ self.slopes[:, :d]
+        apart = ((away[:, None] - away[None]) ** 2).sum(axis=2) + np.diag([np.inf] * len(away))
+        # Of an instance alone there is none.
+        self.noise = (residuals - residuals[apart.argmin(axis=1)]) / math.sqrt(2.0)
         for v in np.flatnonzero(prior[1]):
             # An instance of such a weight moves the mean to that of the prior and of own instances worth 1 / sure.
             pull = prior[1][v] / (prior[1][v] + 1.0 / sure)
@@ -166,12 +169,12 @@ class NaiveLocalLinear:
         return weights[ended].sum() / weights.sum(), np.average(rewards[ended], weights=weights[ended])
 
     def mean_end(self, fit, at, now):
-        """The same where effects vary: the mean over the residuals, if these are larger than the nearest arrival is far."""
+        """The same with noise: the mean over that of each instance, if it is larger than the nearest arrival is far."""
         arrivals = [i for action in range(self.n_actions) for i in self.present(action, now)]
         nearest = min(self.squared(at, i.state + i.effect) for i in arrivals)
-        if np.average((fit.residuals**2).sum(axis=1), weights=fit.weights) <= nearest:
+        if np.average((fit.noise**2).sum(axis=1), weights=fit.weights) <= nearest:
             return self.end_at(at, now)
-        ends, pays = np.array([self.end_at(at + residual, now) for residual in fit.residuals]).T
+        ends, pays = np.array([self.end_at(at + noise, now) for noise in fit.noise]).T
         weights = fit.weights * ends
         return np.average(ends, weights=fit.weights), np.average(pays, weights=weights) if weights.any() else 0.0
 
