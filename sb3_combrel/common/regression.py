@@ -225,7 +225,8 @@ def write_residuals(length, kernel, fit):
 def write_noise(length, fit):
     """Write by how much residuals differ from those of the instance that is nearest to each, in parts of the root of 2.
 
-    Where a line fits badly, as at a wall, residuals are large, and nearly the same beside each other; noise is not (Rice 1984).
+    Where a line fits badly, as at a wall, residuals are large, and nearly the same beside each other; noise is not (Rice 1984,
+    "Bandwidth choice for nonparametric regression").
 
     :return: the weighted mean of the squared lengths
     """
