@@ -51,6 +51,7 @@ class LocalFit(NamedTuple):
     # By how much effects of instances differ from what is fitted of them; what of that is noise; float64, (n_neighbors, d).
     residual: np.ndarray
     noise: np.ndarray
+    noisy: np.ndarray  # float64, (1,): the weighted mean of the squared lengths of the noise; NaN: that is not written yet
 
     @classmethod
     def empty(cls, n_neighbors: int, n_variables: int, ends_by_action: bool = False) -> "LocalFit":
@@ -69,6 +70,7 @@ class LocalFit(NamedTuple):
             number=np.empty((n_numbers, *groups)),
             residual=np.zeros((n_neighbors, d)),
             noise=np.zeros((n_neighbors, d)),
+            noisy=np.full(1, np.nan),
         )
 
 
@@ -204,33 +206,38 @@ def fit_around(at, action, length, instances, kernel, fit):
 
 
 @compiled
-def write_residuals(length, kernel, fit):
-    """Write by how much the effects of instances differ from what is fitted of them; the largest squared length of these."""
-    d = fit.residual.shape[1]
-    per_unit = np.sqrt(-kernel_scale(fit, length, kernel))
+def most_noise(length, kernel, fit):
+    """No noise of an effect (see :func:`write_noise`) has a larger squared length: twice that of the largest residual."""
+    d = fit.noise.shape[1]
+    unit = 1.0 / np.sqrt(-kernel_scale(fit, length, kernel))
+    fit.noisy[0] = np.nan
     largest = 0.0
     for k in range(length):
         square = 0.0
         for v in range(d):
             residual = fit.number[v, k // GROUP, k % GROUP] - fit.solution[0, v]
-            for j in range(d):
-                residual -= fit.solution[j + 1, v] * fit.z[j + 1, k // GROUP, k % GROUP] / per_unit
-            fit.residual[k, v] = residual
+            for j in range(1, d + 1):
+                residual -= fit.solution[j, v] * unit * fit.z[j, k // GROUP, k % GROUP]
             square += residual * residual
         largest = max(largest, square)
-    return largest
+    return 2.0 * largest * (1.0 + 1e-9)
 
 
 @compiled
-def write_noise(length, fit):
+def write_noise(length, kernel, fit):
     """Write by how much residuals differ from those of the instance that is nearest to each, in parts of the root of 2.
 
     Where a line fits badly, as at a wall, residuals are large, and nearly the same beside each other; noise is not (Rice 1984,
     "Bandwidth choice for nonparametric regression").
-
-    :return: the weighted mean of the squared lengths
     """
-    d = fit.residual.shape[1]
+    d = fit.noise.shape[1]
+    per_unit = np.sqrt(-kernel_scale(fit, length, kernel))
+    for k in range(length):
+        for v in range(d):
+            residual = fit.number[v, k // GROUP, k % GROUP] - fit.solution[0, v]
+            for j in range(d):
+                residual -= fit.solution[j + 1, v] * fit.z[j + 1, k // GROUP, k % GROUP] / per_unit
+            fit.residual[k, v] = residual
     total, sum_of_squares = 0.0, 0.0
     for k in range(length):
         nearest, least = k, np.inf
@@ -248,7 +255,7 @@ def write_noise(length, fit):
         weight = fit.weighted[0, k // GROUP, k % GROUP]
         total += weight
         sum_of_squares += weight * square
-    return sum_of_squares / total
+    fit.noisy[0] = sum_of_squares / total
 
 
 @inlined
