@@ -72,7 +72,7 @@ class Around(NamedTuple):
 
 @compiled
 def look_around(at, action, length, experience, kernel, fit):
-    """:class:`Around` of a state, before a prior joins the fit."""
+    """:class:`Around` of the state of a fit, which a prior may have joined."""
     _, arrivals, ends = experience
     of_end = squared_distance_of_end(at, ends, arrivals.periodic)
     if of_end == np.inf:
@@ -166,7 +166,6 @@ def predict_own(experience, linear, grid, has_prior, state, kernel, threshold, f
         if length == 0:
             continue
         fit_around(state, action, length, instances, kernel, fit)
-        around = look_around(state, action, length, experience, kernel, fit)
         if has_prior:
             # Finer effects would be confirmed by instances at a wall, but not at the grid points beside, which lead through.
             first = action * grid.shape[0] * grid.strides[0]
@@ -175,6 +174,7 @@ def predict_own(experience, linear, grid, has_prior, state, kernel, threshold, f
                 for k in range(2 * d):
                     scratch.prior[k] += corner_weight[c] * linear.prior[first + corner[c], k]
             join_prior(scratch.prior, kernel, length, fit)
+        around = look_around(state, action, length, experience, kernel, fit)
         scratch.away[:] = 0.0
         moved = 0.0
         for v in range(d):
@@ -306,11 +306,11 @@ def update_rows(experience, linear, pairs, mdp, grid, kernel, planned, which, tr
             reward, discount, n_touched = 0.0, gamma, np.int64(0)
             if length > 0:
                 fit_around(scratch.at, action, length, instances, kernel, fit)
-                around = look_around(scratch.at, action, length, experience, kernel, fit)
                 if has_prior:
                     for k in range(length):
                         pairs.item[pair, k] = fit.item[k]
                     join_prior(linear.prior[pair], kernel, length, fit)
+                around = look_around(scratch.at, action, length, experience, kernel, fit)
                 for p in range(pairs.fit.shape[1]):
                     for v in range(pairs.fit.shape[2]):
                         pairs.fit[pair, p, v] = fit.solution[p, v]

@@ -65,10 +65,6 @@ class Fit:
         # In instances at the state; that of the nearest alone bounds it, by the broad kernel.
         sure = min(leverage * math.exp(squared[0] / breadth**2), math.exp(squared[0] / broad**2))
         self.design, self.penalty, self.weights, self.effects, self.sure = design, penalty, weights, numbers[:, :d], sure
-        residuals = numbers[:, :d] - self.mean[:d] - away @ self.slopes[:, :d]
-        apart = ((away[:, None] - away[None]) ** 2).sum(axis=2) + np.diag([np.inf] * len(away))
-        # Of an instance alone there is none.
-        self.noise = (residuals - residuals[apart.argmin(axis=1)]) / math.sqrt(2.0)
         for v in np.flatnonzero(prior[1]):
             # An instance of such a weight moves the mean to that of the prior and of own instances worth 1 / sure.
             pull = prior[1][v] / (prior[1][v] + 1.0 / sure)
@@ -77,6 +73,10 @@ class Fit:
             [self.mean[v]], [*slopes] = ridge_regression(all_weights, z, more[:, None])
             self.slopes[:, v] = np.ravel(slopes) / breadth
             self.low[v], self.high[v] = more.min(), more.max()
+        residuals = numbers[:, :d] - self.mean[:d] - away @ self.slopes[:, :d]
+        apart = ((away[:, None] - away[None]) ** 2).sum(axis=2) + np.diag([np.inf] * len(away))
+        # Of an instance alone there is none.
+        self.noise = (residuals - residuals[apart.argmin(axis=1)]) / math.sqrt(2.0)
 
     def at(self, away):
         return np.clip(self.mean + away @ self.slopes, self.low, self.high)
