@@ -206,38 +206,32 @@ def fit_around(at, action, length, instances, kernel, fit):
 
 
 @compiled
-def most_noise(length, kernel, fit):
-    """No noise of an effect (see :func:`write_noise`) has a larger squared length: twice that of the largest residual."""
-    d = fit.noise.shape[1]
-    unit = 1.0 / np.sqrt(-kernel_scale(fit, length, kernel))
-    fit.noisy[0] = np.nan
+def write_residuals(length, kernel, fit):
+    """Write by how much effects differ from what is fitted of them; the largest squared length of these."""
+    d = fit.residual.shape[1]
+    per_unit = np.sqrt(-kernel_scale(fit, length, kernel))
     largest = 0.0
     for k in range(length):
         square = 0.0
         for v in range(d):
             residual = fit.number[v, k // GROUP, k % GROUP] - fit.solution[0, v]
             for j in range(1, d + 1):
-                residual -= fit.solution[j, v] * unit * fit.z[j, k // GROUP, k % GROUP]
+                residual -= fit.solution[j, v] * fit.z[j, k // GROUP, k % GROUP] / per_unit
+            fit.residual[k, v] = residual
             square += residual * residual
         largest = max(largest, square)
-    return 2.0 * largest * (1.0 + 1e-9)
+    fit.noisy[0] = np.nan
+    return largest
 
 
 @compiled
-def write_noise(length, kernel, fit):
+def write_noise(length, fit):
     """Write by how much residuals differ from those of the instance that is nearest to each, in parts of the root of 2.
 
     Where a line fits badly, as at a wall, residuals are large, and nearly the same beside each other; noise is not (Rice 1984,
-    "Bandwidth choice for nonparametric regression").
+    "Bandwidth choice for nonparametric regression"). No noise is larger than the root of 2 times the largest residual.
     """
-    d = fit.noise.shape[1]
-    per_unit = np.sqrt(-kernel_scale(fit, length, kernel))
-    for k in range(length):
-        for v in range(d):
-            residual = fit.number[v, k // GROUP, k % GROUP] - fit.solution[0, v]
-            for j in range(d):
-                residual -= fit.solution[j + 1, v] * fit.z[j + 1, k // GROUP, k % GROUP] / per_unit
-            fit.residual[k, v] = residual
+    d = fit.residual.shape[1]
     total, sum_of_squares = 0.0, 0.0
     for k in range(length):
         nearest, least = k, np.inf

@@ -17,9 +17,9 @@ from sb3_combrel.common.regression import (
     join_prior,
     known_weight,
     leverage_of,
-    most_noise,
     number_at,
     write_noise,
+    write_residuals,
 )
 from sb3_combrel.common.transferred import TransferredInstances
 from sb3_combrel.models.ends import Ends, distance_of_nearest, end_at, reach_of, squared_distance_of_end
@@ -78,7 +78,7 @@ def look_around(at, action, length, experience, kernel, fit):
     if of_end == np.inf:
         return Around(length, 0.0, np.inf, 0.0)
     near = squared_distance(at, arrivals.state[action, fit.item[0]], arrivals.periodic, True)
-    return Around(length, np.sqrt(near), np.sqrt(of_end), np.sqrt(most_noise(length, kernel, fit)))
+    return Around(length, np.sqrt(near), np.sqrt(of_end), np.sqrt(2.0 * write_residuals(length, kernel, fit)))
 
 
 @compiled
@@ -113,7 +113,7 @@ def mean_end(fit, to, near, around, experience, kernel, end):
     most = around.noise * around.noise
     nearest = distance_of_nearest(to, most, 0.0, kernel.outcome_breadth, arrivals, ends.hint)
     if nearest < most and np.isnan(fit.noisy[0]):
-        write_noise(around.length, kernel, fit)
+        write_noise(around.length, fit)
     if nearest == most or fit.noisy[0] <= nearest:
         end_at(to, near, kernel.outcome_breadth, arrivals, ends, end)
         return
