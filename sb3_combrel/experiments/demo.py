@@ -36,7 +36,7 @@ from sb3_combrel.runs.runner import (
     run_missing,
 )
 from sb3_combrel.runs.source_files import FOLDER as SOURCES
-from sb3_combrel.runs.source_files import load_or_learn
+from sb3_combrel.runs.source_files import SourceJob, load_or_learn
 
 TENSORBOARD = "tensorboard"
 FIGURE, TABLES, RESULTS = "learning_curves.png", "tables.md", "results.csv"
@@ -132,7 +132,9 @@ def run_demo(
     if fresh:
         _forget(output)
     files = [output / SOURCES / f"{SOURCE}{seed}.npz" for seed in range(n_seeds)]
-    sources = [load_or_learn(file, mountain_car.learn_source, seed, console) for seed, file in enumerate(files)]
+    learn = mountain_car.learn_source
+    wanted = [SourceJob(group="mountain_car_2d", seed=seed, path=file, learn=learn) for seed, file in enumerate(files)]
+    sources = load_or_learn(wanted, Backend(n_jobs=workers), console)
     learner = {**mountain_car.LEARNER, **({} if model_breadth is None else {"model_breadth": model_breadth})}
     task: dict[str, Any] = {"env": mountain_car.TARGET_ID, "n_episodes": n_episodes, "max_episode_steps": max_episode_steps}
     runs = [

@@ -155,8 +155,8 @@ def run_missing(
     missing = [job for job in jobs if job.name not in found]
     if found:
         console.print(f"{len(found)} of {len(jobs)} runs were complete already.")
-    with _progress(jobs, missing, console) as advance:
-        for job, result in _carry_out(missing, backend):
+    with show_progress(jobs, missing, console) as advance:
+        for job, result in carry_out(missing, backend):
             found[job.name] = result
             if folder is not None:
                 _write(job, settings[job.name], result, folder)
@@ -251,7 +251,7 @@ def _write(job: Job, settings: dict[str, Any], result: Result, output: Path) -> 
         raise type(error)(f"{wrong}; runs that were finished are kept there, and the same call goes on from them") from error
 
 
-def _carry_out(jobs: Sequence[Job], backend: Backend) -> Iterator[tuple[Job, Result]]:
+def carry_out(jobs: Sequence[Job], backend: Backend) -> Iterator[tuple[Job, Result]]:
     """Jobs and their results, as they finish. What died with its worker is begun again."""
     # As bytes a job goes through one and the same pickler once, whatever the backend makes of it.
     packed = {job.name: (job, _pack(job)) for job in jobs}
@@ -393,7 +393,7 @@ def _dask(backend: Backend) -> Iterator[Callable[[list[_Packed]], Iterator[_Outc
 
 
 @contextmanager
-def _progress(jobs: Sequence[Job], missing: Sequence[Job], console: Console) -> Iterator[Callable[[Job, Result], None]]:
+def show_progress(jobs: Sequence[Job], missing: Sequence[Job], console: Console) -> Iterator[Callable[[Job, Result], None]]:
     """Bars of progress, one a method or, of several groups, one a group; in a log file a line for each run."""
     columns = (
         TextColumn("{task.description:<26}"),

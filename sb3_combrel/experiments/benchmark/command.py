@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
+from itertools import islice, product
 from pathlib import Path
 
 from rich.console import Console
@@ -28,7 +28,7 @@ from sb3_combrel.runs.described import described
 from sb3_combrel.runs.job import file_name
 from sb3_combrel.runs.runner import FOLDER as RUNS
 from sb3_combrel.runs.runner import LOCAL, Backend, JobError, prepare_folder, run_missing
-from sb3_combrel.runs.source_files import FOLDER, load_or_learn
+from sb3_combrel.runs.source_files import FOLDER, SourceJob, try_sources
 
 ALL = "all"
 OUTPUT = Path("benchmark")
@@ -78,7 +78,7 @@ def benchmark(
     if few := few_runs(seeds, n_compared(chosen_pairs, chosen_methods)):
         console.print(few, markup=False, soft_wrap=True)
     all_seeds = range(first_seed, first_seed + seeds)
-    sources, failed = prepare_sources(chosen_pairs, all_seeds, output, console)
+    sources, failed = prepare_sources(chosen_pairs, all_seeds, output, backend, console)
     for pair in chosen_pairs:
         pair.check_known(next((given for seed in all_seeds if (given := sources[pair.name, seed])), ()))
     jobs = jobs_of(chosen_pairs, chosen_methods, all_seeds, sources)
@@ -120,23 +120,28 @@ def methods_of(names: Sequence[str]) -> list[Method]:
 
 
 def prepare_sources(
-    pairs: Sequence[Pair], seeds: Sequence[int], output: Path, console: Console
+    pairs: Sequence[Pair], seeds: Sequence[int], output: Path, backend: Backend, console: Console
 ) -> tuple[dict[tuple[str, int], tuple[SourceInstances, ...]], dict[tuple[str, int], str]]:
     """Learn or load the sources of pairs, one of each for each seed.
 
     :return: by the pair's name and the seed, instances, () where they could not be learned; and why not
     """
+
+    def job_of(source: Source, pair: Pair, seed: int) -> SourceJob:
+        path = output / FOLDER / file_of(source, pair, seed)
+        return SourceJob(group=pair.name, method=f"source {source.name}", seed=seed, path=path, learn=source.learn)
+
+    jobs = {(pair.name, seed): [job_of(source, pair, seed) for source in pair.sources] for pair, seed in product(pairs, seeds)}
+    results = iter(try_sources([job for row in jobs.values() for job in row], backend, console))
     found: dict[tuple[str, int], tuple[SourceInstances, ...]] = {}
     failed: dict[tuple[str, int], str] = {}
-    for pair, seed in product(pairs, seeds):
-        found[pair.name, seed] = ()
-        try:
-            rows = [(output / FOLDER / file_of(source, pair, seed), source.learn) for source in pair.sources]
-            found[pair.name, seed] = tuple(load_or_learn(file, learn, seed, console) for file, learn in rows)
-        except Exception as error:  # a third party's environment raises what it likes
-            why = f"its source could not be learned: {type(error).__name__}: {' '.join(str(error).split())}"
-            failed[pair.name, seed] = why
-            console.print(f"{pair.name}, seed {seed}: {why}", markup=False, soft_wrap=True)
+    for (pair_name, seed), row in jobs.items():
+        made = list(islice(results, len(row)))
+        errors = [each.error for each in made if each.error]
+        found[pair_name, seed] = () if errors else tuple(each.more["instances"] for each in made)
+        if errors:
+            failed[pair_name, seed] = why = f"its source could not be learned: {errors[0]}"
+            console.print(f"{pair_name}, seed {seed}: {why}", markup=False, soft_wrap=True)
     return found, failed
 
 

@@ -15,7 +15,8 @@ from sb3_combrel.experiments.paper.domains import BEST, DOMAINS, ICUB, MOUNTAIN_
 from sb3_combrel.experiments.paper.mappings import best_mappings
 from sb3_combrel.experiments.tasks.mountain_car import factored_mapping, intuitive_mapping
 from sb3_combrel.mappings.named_sets import resolve
-from sb3_combrel.runs.source_files import FOLDER, load_or_learn
+from sb3_combrel.runs.runner import Backend
+from sb3_combrel.runs.source_files import FOLDER, SourceJob, load_or_learn
 from sb3_combrel.transfer.base import Transfer
 
 NO_TRANSFER = "no transfer"
@@ -63,21 +64,29 @@ class Sources:
     frequent: InterTaskMapping | None = None  # COMBREL's most frequent mapping, once its runs are complete
 
 
-def prepare_sources(domain: Domain, seeds: Iterable[int], output: Path, console: Console) -> dict[int, Sources]:
+def prepare_sources(
+    domain: Domain, seeds: Iterable[int], output: Path, backend: Backend, console: Console
+) -> dict[int, Sources]:
     """Learn the source tasks of a domain with each seed, or load what was learned before from the output folder."""
-
-    def instances_of(each: Domain, seed: int) -> SourceInstances:
-        return load_or_learn(output / FOLDER / f"{each.name}_seed{seed}.npz", each.learn_source, seed, console)
 
     def record_target(seed: int) -> SourceInstances:
         max_value = domain.settings[PAPER].learner["max_value"]
         return SourceInstances.from_fitted_rmax(domain.target_id, N_TARGET_TRANSITIONS, seed, max_value=max_value)
 
     (other,) = (each for each in DOMAINS.values() if each.name != domain.name)
-    target = None
+    seeds = list(seeds)
+    wanted = [
+        SourceJob(group=each.name, seed=seed, path=output / FOLDER / f"{each.name}_seed{seed}.npz", learn=each.learn_source)
+        for each in (domain, other)
+        for seed in seeds
+    ]
     if domain.name == ICUB.name:
-        target = load_or_learn(output / FOLDER / f"{domain.name}_target.npz", record_target, TARGET_SEED, console)
-    return {seed: Sources(instances_of(domain, seed), instances_of(other, seed), target) for seed in seeds}
+        path = output / FOLDER / f"{domain.name}_target.npz"
+        wanted.append(SourceJob(group=domain.name, method="target", seed=TARGET_SEED, path=path, learn=record_target))
+    found = load_or_learn(wanted, backend, console)
+    n = len(seeds)
+    target = found[2 * n] if len(found) > 2 * n else None
+    return {seed: Sources(found[k], found[n + k], target) for k, seed in enumerate(seeds)}
 
 
 def methods_in(domain: Domain, setting: Setting) -> list[str]:

@@ -73,7 +73,7 @@ def reproduce(
         n_episodes = episodes or domain.n_episodes
         _check_folder(output, domain.name, setting, n_episodes)
         seeds = range(domain.first_seed, domain.first_seed + (runs or domain.settings[setting].n_runs))
-        sources[domain.name] = own = m.prepare_sources(domain, seeds, output, console)
+        sources[domain.name] = own = m.prepare_sources(domain, seeds, output, backend, console)
         methods = [name for name in methods_of(targets, domain, setting) if name != m.TIMBREL_FREQUENT]
         wanted = {each.name for each in targets if domain.name in each.methods}
         jobs += jobs_of(domain, setting, methods, own, n_episodes)

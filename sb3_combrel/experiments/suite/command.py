@@ -26,7 +26,7 @@ from sb3_combrel.experiments.suite.tasks import Task, tasks_of
 from sb3_combrel.experiments.suite.transfers import check_transfer
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 from sb3_combrel.runs.runner import Backend, check_all_succeeded, prepare_folder, run_missing
-from sb3_combrel.runs.source_files import FOLDER, load_or_learn
+from sb3_combrel.runs.source_files import FOLDER, SourceJob, load_or_learn
 
 TABLES, BY_TASK = "tables", "tasks.md"
 DEFAULT = "default"
@@ -103,13 +103,15 @@ def run_suite(
     console = console or Console()
     prepare_folder(output)
     wanted = {source.name: source for task in tasks for own in variants if (source := own.source(task)) is not None}
-    sources = {
-        (source.name, seed): load_or_learn(output / FOLDER / f"{source.name}_seed{seed}.npz", source.learn, seed, console)
+    files = [
+        SourceJob(group=source.name, seed=seed, path=output / FOLDER / f"{source.name}_seed{seed}.npz", learn=source.learn)
         for seed in seeds
         for source in wanted.values()
-    }
+    ]
+    backend = Backend(n_jobs=jobs)
+    sources = dict(zip([(file.group, file.seed) for file in files], load_or_learn(files, backend, console), strict=True))
     runs = suite_runs(tasks, variants, seeds, evaluation_episodes, sources)
-    results = run_missing(runs, output, Backend(n_jobs=jobs), console)
+    results = run_missing(runs, output, backend, console)
     write_csv_files(output)
     check_all_succeeded(results)
     cells = cells_of([result.more["row"] for result in results], tasks, names, reference, test)

@@ -17,7 +17,7 @@ from sb3_combrel.experiments.benchmark.command import prepare_sources
 from sb3_combrel.experiments.benchmark.pair import Pair
 from sb3_combrel.experiments.benchmark.third_party import load_attribute
 from sb3_combrel.experiments.suite.tasks import Source
-from sb3_combrel.runs.runner import FOLDER
+from sb3_combrel.runs.runner import FOLDER, Backend
 
 FAILING = '''
 from sb3_combrel import COMBREL
@@ -245,7 +245,7 @@ class TestFailures:
             return walk_source()
 
         pair = Pair("lucky", "", (Source("walk", learn),), "CartPole-v1", n_episodes=1)
-        found, failed = prepare_sources([pair], range(3), tmp_path, Console(quiet=True))
+        found, failed = prepare_sources([pair], range(3), tmp_path, Backend(n_jobs=1), Console(quiet=True))
         assert failed == {("lucky", 1): "its source could not be learned: RuntimeError: no luck"}
         assert [len(found["lucky", seed]) for seed in range(3)] == [1, 0, 1]
 

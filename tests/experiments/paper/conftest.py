@@ -9,6 +9,7 @@ import combrel_envs  # noqa: F401 - registers the tasks
 from sb3_combrel import SourceInstances
 from sb3_combrel.experiments.paper import methods
 from sb3_combrel.experiments.paper.domains import DOMAINS
+from sb3_combrel.runs.runner import Backend
 
 #: Enough for COMBREL to select mappings in the second episode, too few to reach a goal.
 SHORT = 60
@@ -31,4 +32,4 @@ def short():
 def sources(short, tmp_path_factory):
     """What the methods transfer, by domain and seed."""
     folder = tmp_path_factory.mktemp("sources")
-    return {name: methods.prepare_sources(domain, SEEDS, folder, quiet()) for name, domain in short.items()}
+    return {name: methods.prepare_sources(domain, SEEDS, folder, Backend(n_jobs=1), quiet()) for name, domain in short.items()}

@@ -68,18 +68,19 @@ def test_a_suite_is_written_run_by_run_and_resumed(tmp_path):
 
 
 def test_a_variant_with_transfer_learns_a_source_once_for_each_seed(tmp_path):
-    calls = []
+    calls = tmp_path / "calls.txt"
 
     def learn(seed):
-        calls.append(seed)
+        with calls.open("a") as file:
+            file.write(f"{seed} ")
         return SourceInstances.record(None, make_point_robot(2), n_instances=100, seed=seed)
 
     task = Task("robot", partial(make_point_robot, 3), n_steps=150, source=Source("robot_2d", learn))
     run(tmp_path, tasks=[task], variants=[Variant("combrel", {"gamma": 0.99}, "COMBREL")])
     rows = pd.read_csv(tmp_path / "runs.csv")
-    assert calls == [5, 6]
+    assert calls.read_text() == "5 6 "
     assert [json.loads(own)["source"] for own in rows["settings"]] == ["robot_2d, seed 5", "robot_2d, seed 6"]
-    one, other = (SourceInstances.load(tmp_path / "sources" / f"robot_2d_seed{seed}.npz") for seed in calls)
+    one, other = (SourceInstances.load(tmp_path / "sources" / f"robot_2d_seed{seed}.npz") for seed in (5, 6))
     assert one.n_variables == 2 and not np.array_equal(one.states, other.states)
     # Neither the right mapping nor a source of another domain is known for a task of our own.
     unknown = {"oracle": "nobody knows the mapping of robot", "oracle-instances": "nobody knows the mapping of robot"}
