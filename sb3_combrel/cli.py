@@ -72,6 +72,8 @@ def record(
     from sb3_combrel.runs.job import make_env
 
     console = Console()
+    if output.is_dir():
+        raise ValueError(f"output must be a file, such as {output / 'source.npz'}, got the folder {output}")
     file = output if output.suffix == ".npz" else output.with_name(output.name + ".npz")
     if file.exists() and not overwrite:
         raise ValueError(f"{file} exists; use --overwrite or another --output")
@@ -180,6 +182,8 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "reproduce": reproduce,
     "benchmark": benchmark,
 }
+#: Those that keep what they have finished.
+RESUMED = ("demo", "reproduce", "benchmark")
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -214,7 +218,8 @@ def main(args: Sequence[str] | None = None) -> int:
         print(f"sb3-combrel: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("\nStopped. The same command goes on from here.", file=sys.stderr)
+        given = sys.argv[1:] if args is None else args
+        print("\nStopped." + " The same command goes on from here." * (given[0] in RESUMED), file=sys.stderr)
         return 130
     return 0
 

@@ -39,6 +39,7 @@ class TestRecord:
         ("arguments", "message"),
         [
             (("--output", "/dev/null/source.npz"), "output must be in a folder that can be written to, got /dev/null"),
+            (("--output", "."), "output must be a file, such as source.npz, got the folder ."),
             (("--seed", "-1"), "seed must be a whole number of at least 0, got -1"),
         ],
     )
@@ -62,6 +63,15 @@ class TestRecord:
 
 
 class TestCommandLine:
+    @pytest.mark.parametrize(("command", "goes_on"), [("benchmark", True), ("record", False)])
+    def test_a_command_that_is_stopped_promises_what_it_does(self, monkeypatch, command, goes_on):
+        def stopped(*_, **__):
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("tyro.extras.subcommand_cli_from_dict", stopped)
+        status, written = call_for_all_output(command, "combrel/MountainCar2D-v0")
+        assert status == 130 and "Stopped." in written and ("goes on from here" in written) == goes_on
+
     def test_help_names_the_commands(self):
         status, written = call_for_all_output("--help")
         assert status == 0 and all(name in written for name in ("demo", "record", "reproduce", "benchmark"))
