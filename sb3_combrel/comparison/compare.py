@@ -6,10 +6,12 @@ import hashlib
 import inspect
 import json
 import os
-from collections.abc import Mapping, Sequence
-from contextlib import closing
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any
 
 import gymnasium as gym
@@ -29,7 +31,7 @@ from sb3_combrel.mappings.mapping_set import MappingSet
 from sb3_combrel.pages.snapshot import snapshot_of
 from sb3_combrel.runs.described import described
 from sb3_combrel.runs.job import Job, Result, Task, TransferLike, chosen_on_purpose, file_name
-from sb3_combrel.runs.runner import Backend, check_all_succeeded, prepare_folder, run_missing
+from sb3_combrel.runs.runner import Backend, check_all_succeeded, prepare_folder, read_results, run_missing
 from sb3_combrel.sources.recipes import task_spec
 from sb3_combrel.transfer.base import Transfer
 
@@ -120,11 +122,13 @@ def compare(
     :param n_jobs: runs at a time, each in a process of its own; 1: one after the other in this process; None: one a core.
         Results do not depend on it.
     :param progress_bar: show which runs are complete; None: in a terminal or notebook
-    :param output: folder in which finished runs are kept: the same call, or one with more methods or seeds, goes on from
-        there. Where the source of the environment's class, its wrappers or the function that makes it, or that of a
-        method's class, has changed, it is refused, as where that of a class which these inherit from has, or a value that
-        the function holds: a default, a variable of an enclosing function, plain global data, attributes of its object;
-        and where the content of ``instances`` has. What else these call is not noticed: take another folder then
+    :param output: folder in which finished runs are kept; None: in a temporary one, which stays, and is named, if the call
+        fails or is stopped, unless the task or a method does not say what its arguments are. The same call, or one with more
+        methods or seeds, goes on from there. Where the source of the environment's class, its wrappers or the function that
+        makes it, or that of a method's class, has changed, it is refused, as where that of a class which these inherit from
+        has, or a value that the function holds: a default, a variable of an enclosing function, plain global data,
+        attributes of its object; and where the content of ``instances`` has. What else these call is not noticed: take
+        another folder then
     :param learner: further arguments of :class:`~sb3_combrel.FittedRMax`, the same for all methods: ``gamma=0.99``
     :return: learning curves, measures, p-values, table, figure and sentence
     :raises TypeError: if :class:`~sb3_combrel.FittedRMax` has no such argument
@@ -162,16 +166,21 @@ def compare(
             in_use[CONTROL], first[CONTROL] = _try_out(run), run
         except ValueError as error:
             warn_user(f"there is no control ({error}): controls=False leaves it out without a warning")
-    if folder is not None:
-        classes = _classes_of(next(iter(first.values())))
-        kept = {method: _kept_settings(method, in_use[method]) for method in first}
-        first = {method: replace(run, in_use=kept[method], classes=classes) for method, run in first.items()}
+    can_be_kept = True
+    try:
+        first = _told_apart(first, in_use)
+    except (ValueError, TypeError, OSError):
+        if folder is not None:
+            raise
+        can_be_kept = False
     runs = [replace(run, seed=seed, is_shown=seed == numbers[0]) for run in first.values() for seed in numbers]
     console = Console(stderr=True)
     shown = console.is_terminal or console.is_jupyter if progress_bar is None else progress_bar
-    results = run_missing(runs, output=folder, backend=Backend(n_jobs=n_jobs), console=console if shown else None)
-    check_all_succeeded(results)
-    check_episodes(results, steps, folder)
+    how: dict[str, Any] = {"backend": Backend(n_jobs=n_jobs), "console": console if shown else None}
+    with _kept_if_it_fails() if folder is None and can_be_kept else nullcontext(folder) as kept:
+        results = run_missing(runs, output=kept, must_keep=folder is not None, **how)
+        check_all_succeeded(results)
+        check_episodes(results, steps, kept)
     by_method = {method: results[k * len(numbers) : (k + 1) * len(numbers)] for k, method in enumerate(first)}
     found = evaluate(by_method, baseline, threshold, _name_of(env), name_of_control(in_use))
     for words in found.warnings:
@@ -194,6 +203,35 @@ def _try_out(run: ComparedRun) -> Transfer | None:
         # Subclasses may ask for more than a message.
         kind = next(kind for kind in (FileNotFoundError, OSError, TypeError, ValueError) if isinstance(error, kind))
         raise kind(f"{run.method}: {error}") from error
+
+
+def _told_apart(first: Mapping[str, ComparedRun], in_use: Mapping[str, Transfer | None]) -> dict[str, ComparedRun]:
+    """The first run of each method, with all by which its runs in a folder are told from others.
+
+    :raises ValueError: if a method, or what makes the environment, does not say it
+    """
+    classes = _classes_of(next(iter(first.values())))
+    found = {
+        method: replace(run, in_use=_kept_settings(method, in_use[method]), classes=classes) for method, run in first.items()
+    }
+    for run in found.values():
+        run.settings()
+    return found
+
+
+@contextmanager
+def _kept_if_it_fails() -> Iterator[Path]:
+    """A temporary folder for runs, which stays, and is named, if not all come to their end."""
+    folder = Path(mkdtemp(prefix="sb3_combrel_compare_"))
+    try:
+        yield folder
+    except BaseException as error:
+        if read_results(folder):
+            error.add_note(f"Finished runs are kept: the same call with output={str(folder)!r} goes on from them.")
+        else:
+            shutil.rmtree(folder)
+        raise
+    shutil.rmtree(folder)
 
 
 def _classes_of(run: ComparedRun) -> tuple[type, ...]:
@@ -243,7 +281,7 @@ def check_output(output: Any) -> Path | None:
     if output is None:
         return None
     if not isinstance(output, str | os.PathLike):
-        raise ValueError(f"output must be the path of a folder, or None to keep nothing, got {output!r}")
+        raise ValueError(f"output must be the path of a folder, or None, got {output!r}")
     folder = Path(output)
     prepare_folder(folder)
     return folder

@@ -17,7 +17,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -128,6 +128,7 @@ def run_missing(
     output: str | os.PathLike[str] | None = None,
     backend: Backend = LOCAL,
     console: Console | None = None,
+    must_keep: bool = True,
 ) -> list[Result]:
     """
     Carry out the jobs that have no result yet.
@@ -140,6 +141,7 @@ def run_missing(
     :param output: folder that the results are written to, in :data:`FOLDER`, and found in; None: they are only returned
     :param backend: where jobs are carried out
     :param console: where to show the progress; None: nowhere
+    :param must_keep: whether a result that cannot be written is an error; else it is only returned
     :return: the results of all jobs, in their order, those that failed too, see :func:`check_all_succeeded`
     :raises ValueError: if two jobs have one name, a job cannot be pickled, or the folder has results of other settings, or
         files that are not results
@@ -159,7 +161,8 @@ def run_missing(
         for job, result in carry_out(missing, backend):
             found[job.name] = result
             if folder is not None:
-                _write(job, settings[job.name], result, folder)
+                with nullcontext() if must_keep else suppress(TypeError, OSError):
+                    _write(job, settings[job.name], result, folder)
             advance(job, result)
     return [found[job.name] for job in jobs]
 

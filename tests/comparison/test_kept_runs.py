@@ -24,7 +24,7 @@ from sb3_combrel.comparison import compare as module
 from sb3_combrel.comparison.compare import ComparedRun, compare
 from sb3_combrel.comparison.controls import CONTROL
 from sb3_combrel.runs.described import described
-from sb3_combrel.runs.runner import FOLDER, Backend, run_missing
+from sb3_combrel.runs.runner import FOLDER, Backend, JobError, run_missing
 
 METHODS = {"none": None, "COMBREL": COMBREL(walk_source(), use="instances")}
 CALL = dict(env=Walk, methods=METHODS, seeds=1, steps=60, model_breadth=0.15, resolution=3, degree=0)
@@ -405,7 +405,7 @@ def test_an_output_that_cannot_be_one_is_refused_before_anything_is_tried_out(ki
     ]
     monkeypatch.setattr(module, "_try_out", lambda run: pytest.fail("the error should have come before"))
     message = {
-        "number": "output must be the path of a folder, or None to keep nothing, got 3",
+        "number": "output must be the path of a folder, or None, got 3",
         "others": "has files that are not",
     }
     with pytest.raises(
@@ -464,6 +464,41 @@ def test_a_report_that_cannot_be_kept_says_so(monkeypatch, tmp_path):
     assert run_missing([run], backend=Backend(n_jobs=1))[0].error == ""
     with pytest.raises(TypeError, match=r"Mine, seed 0: cannot write <object object .*> as plain data"):
         run_missing([run], tmp_path, Backend(n_jobs=1))
+    assert "odd" in quietly().reports["COMBREL"][0]
+
+
+@pytest.mark.parametrize("how", ["stopped", "no episode", "failed"])
+def test_without_a_folder_finished_runs_are_lost_neither(carried_out, monkeypatch, tmp_path, how):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    carry_out = ComparedRun.carry_out
+
+    def break_down(run):
+        if run.method != CONTROL and run.seed == 0:
+            return carry_out(run)
+        if how == "no episode":
+            return replace(carry_out(run), steps=[])
+        raise KeyboardInterrupt if how == "stopped" else RuntimeError("simulator lost")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ComparedRun, "carry_out", break_down)
+        with pytest.raises((KeyboardInterrupt, ValueError, JobError)) as caught:
+            quietly(seeds=2)
+    (folder,) = tmp_path.glob("sb3_combrel_*")
+    assert caught.value.__notes__ == [f"Finished runs are kept: the same call with output={str(folder)!r} goes on from them."]
+    carried_out.clear()
+    quietly(seeds=1, controls=False, output=folder)
+    done = [("COMBREL", 0)] if how == "stopped" else []
+    assert carried_out == done, "but those that came after"
+
+
+def test_the_temporary_folder_does_not_stay(monkeypatch, tmp_path):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    quietly()
+    with monkeypatch.context() as patch:
+        patch.setattr(ComparedRun, "carry_out", lambda run: 1 / 0)
+        with pytest.raises(JobError) as caught:
+            quietly()
+    assert not any(tmp_path.glob("sb3_combrel_*")) and not hasattr(caught.value, "__notes__")
 
 
 def test_a_run_without_an_episode_does_not_lose_the_others(carried_out, tmp_path, monkeypatch):
