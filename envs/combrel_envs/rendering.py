@@ -12,12 +12,18 @@ _ADVICE = (
     "On a machine without a display install Mesa's EGL (Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri) "
     "and set MUJOCO_GL=egl before Python starts, or install libosmesa6 and set MUJOCO_GL=osmesa."
 )
+_FORKED = (
+    "Rendering hangs in a process that was forked after its parent had drawn: start workers by spawn or forkserver, such as "
+    "multiprocessing.get_context('spawn'), SubprocVecEnv(..., start_method='spawn') or AsyncVectorEnv(..., context='spawn')."
+)
 #: Why OpenGL doesn't start in this process, once that is known.
 _failure: Exception | None = None
+#: The process in which it has started.
+_started_in: int | None = None
 
 
 class RenderingError(RuntimeError):
-    """No picture can be drawn, because OpenGL is missing or doesn't start."""
+    """No picture can be drawn, because OpenGL is missing, doesn't start, or was started before the process was forked."""
 
 
 def import_dm_control() -> None:
@@ -48,11 +54,14 @@ def import_dm_control() -> None:
 
 def open_gl(physics: Any) -> None:
     """Start OpenGL for a ``dm_control.mujoco.Physics``, if it isn't started; a RenderingError says what to install or set."""
-    global _failure
+    global _failure, _started_in
+    if _started_in not in (None, os.getpid()):
+        raise RenderingError(_FORKED)
     # No second attempt after a failure: with some drivers it ends the process.
     if _failure is None:
         try:
             _ = physics.contexts
+            _started_in = os.getpid()
         except Exception as error:
             # Smaller pictures can be drawn in this process.
             if "framebuffer is not complete" in str(error):

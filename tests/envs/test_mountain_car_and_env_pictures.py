@@ -350,10 +350,32 @@ def test_a_picture_that_is_too_large_says_so_and_smaller_ones_are_drawn_afterwar
     assert envs[1].render().shape == (48, 64, 3)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no processes are forked there")
+@pytest.mark.parametrize("env_id", [CAR_4D, TORSO])
+def test_a_process_that_is_forked_after_drawing_says_so_instead_of_hanging(env_id):
+    code = f"""
+import os, combrel_envs, gymnasium
+envs = [gymnasium.make("{env_id}", render_mode="rgb_array", width=64, height=48) for _ in range(2)]
+for env in envs:
+    env.reset()
+print(envs[0].render().shape, flush=True)
+if os.fork() == 0:
+    for env in envs:
+        try:
+            env.render()
+        except combrel_envs.RenderingError as error:
+            print(error, flush=True)
+    os._exit(0)
+os.wait()
+"""
+    assert run(code).count("(48, 64, 3)\nRendering hangs in a process that was forked after") == 1
+    assert run(code.replace("print(envs[0].render().shape, flush=True)", "")) == "", "the first to draw is the forked one"
+
+
 def run(code, **variables):
     """What a Python process prints."""
     environ = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), **variables}
-    done = subprocess.run([sys.executable, "-c", code], env=environ, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", code], env=environ, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
