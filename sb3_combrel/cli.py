@@ -218,8 +218,9 @@ def main(args: Sequence[str] | None = None) -> int:
         print(f"sb3-combrel: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        given = sys.argv[1:] if args is None else args
-        print("\nStopped." + " The same command goes on from here." * (given[0] in RESUMED), file=sys.stderr)
+        command = (sys.argv[1:] if args is None else list(args))[:1]
+        goes_on = any(name in RESUMED for name in command)
+        print("\nStopped." + " The same command goes on from here." * goes_on, file=sys.stderr)
         return 130
     return 0
 

@@ -63,13 +63,13 @@ class TestRecord:
 
 
 class TestCommandLine:
-    @pytest.mark.parametrize(("command", "goes_on"), [("benchmark", True), ("record", False)])
+    @pytest.mark.parametrize(("command", "goes_on"), [(["benchmark"], True), (["record", "CartPole-v1"], False), ([], False)])
     def test_a_command_that_is_stopped_promises_what_it_does(self, monkeypatch, command, goes_on):
         def stopped(*_, **__):
             raise KeyboardInterrupt
 
         monkeypatch.setattr("tyro.extras.subcommand_cli_from_dict", stopped)
-        status, written = call_for_all_output(command, "combrel/MountainCar2D-v0")
+        status, written = call_for_all_output(*command)
         assert status == 130 and "Stopped." in written and ("goes on from here" in written) == goes_on
 
     def test_help_names_the_commands(self):
