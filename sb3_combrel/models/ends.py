@@ -122,9 +122,15 @@ def end_at(state, near, outcome_breadth, arrivals, ends, found):
     """
     found[0], found[1] = 0.0, 0.0
     of_end = squared_distance_of_end(state, ends, arrivals.periodic)
-    if of_end > reach_of(near, outcome_breadth):
-        return
-    nearest = distance_of_nearest(state, min(near, of_end), of_end, outcome_breadth, arrivals, ends.hint)
+    if of_end <= reach_of(near, outcome_breadth):
+        nearest = distance_of_nearest(state, min(near, of_end), of_end, outcome_breadth, arrivals, ends.hint)
+        weigh_ends(state, of_end, nearest, outcome_breadth, arrivals, found)
+
+
+@compiled
+def weigh_ends(state, of_end, nearest, outcome_breadth, arrivals, found):
+    """:func:`end_at` where the squared distances of the nearest end and of the nearest arrival are known."""
+    found[0], found[1] = 0.0, 0.0
     reach = reach_of(nearest, outcome_breadth)
     if of_end > reach:
         return

@@ -22,7 +22,7 @@ from sb3_combrel.common.regression import (
     write_residuals,
 )
 from sb3_combrel.common.transferred import TransferredInstances
-from sb3_combrel.models.ends import Ends, distance_of_nearest, end_at, reach_of, squared_distance_of_end
+from sb3_combrel.models.ends import Ends, distance_of_nearest, end_at, reach_of, squared_distance_of_end, weigh_ends
 from sb3_combrel.models.grid_model import add_to_row, total_weight
 from sb3_combrel.models.grid_points import PairArrays, note_fit
 from sb3_combrel.planning.grid import (
@@ -106,16 +106,17 @@ def mean_end(fit, to, near, around, experience, kernel, end):
     :param near: squared distance of some arrival
     """
     _, arrivals, ends = experience
-    of_end = max(np.sqrt(squared_distance_of_end(to, ends, arrivals.periodic)) - around.noise, 0.0)
-    if of_end * of_end > reach_of((np.sqrt(near) + around.noise) ** 2, kernel.outcome_breadth):
+    of_end = squared_distance_of_end(to, ends, arrivals.periodic)
+    apart = max(np.sqrt(of_end) - around.noise, 0.0)
+    if apart * apart > reach_of((np.sqrt(near) + around.noise) ** 2, kernel.outcome_breadth):
         return
-    # Where no arrival is as near as any noise, the mean effect says where one arrives.
     most = around.noise * around.noise
-    nearest = distance_of_nearest(to, most, 0.0, kernel.outcome_breadth, arrivals, ends.hint)
+    nearest = distance_of_nearest(to, max(most, near), 0.0, kernel.outcome_breadth, arrivals, ends.hint)
     if nearest < most and np.isnan(fit.noisy[0]):
         write_noise(around.length, fit)
-    if nearest == most or fit.noisy[0] <= nearest:
-        end_at(to, near, kernel.outcome_breadth, arrivals, ends, end)
+    # Where no arrival is as near as the noise is large, the mean effect says where one arrives.
+    if nearest >= most or fit.noisy[0] <= nearest:
+        weigh_ends(to, of_end, nearest, kernel.outcome_breadth, arrivals, end)
         return
     total, ended, paid = 0.0, 0.0, 0.0
     for k in range(around.length):
