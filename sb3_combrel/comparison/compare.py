@@ -176,9 +176,14 @@ def compare(
     runs = [replace(run, seed=seed, is_shown=seed == numbers[0]) for run in first.values() for seed in numbers]
     console = Console(stderr=True)
     shown = console.is_terminal or console.is_jupyter if progress_bar is None else progress_bar
-    how: dict[str, Any] = {"backend": Backend(n_jobs=n_jobs), "console": console if shown else None}
     with _kept_if_it_fails() if folder is None and can_be_kept else nullcontext(folder) as kept:
-        results = run_missing(runs, output=kept, must_keep=folder is not None, **how)
+        results = run_missing(
+            runs,
+            output=kept,
+            must_keep=folder is not None,
+            backend=Backend(n_jobs=n_jobs),
+            console=console if shown else None,
+        )
         check_all_succeeded(results)
         check_episodes(results, steps, kept)
     by_method = {method: results[k * len(numbers) : (k + 1) * len(numbers)] for k, method in enumerate(first)}

@@ -84,9 +84,11 @@ def prepare_sources(
         path = output / FOLDER / f"{domain.name}_target.npz"
         wanted.append(SourceJob(group=domain.name, method="target", seed=TARGET_SEED, path=path, learn=record_target))
     found = load_or_learn(wanted, backend, console)
-    n = len(seeds)
-    target = found[2 * n] if len(found) > 2 * n else None
-    return {seed: Sources(found[k], found[n + k], target) for k, seed in enumerate(seeds)}
+    own, unrelated, target = found[: len(seeds)], found[len(seeds) : 2 * len(seeds)], found[2 * len(seeds) :]
+    return {
+        seed: Sources(of_domain, of_other, target[0] if target else None)
+        for seed, of_domain, of_other in zip(seeds, own, unrelated, strict=True)
+    }
 
 
 def methods_in(domain: Domain, setting: Setting) -> list[str]:
