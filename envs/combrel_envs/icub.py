@@ -23,6 +23,7 @@ from dm_control.rl import control  # noqa: E402
 from dm_control.utils import containers  # noqa: E402
 
 from combrel_envs import icub_model  # noqa: E402
+from combrel_envs.environment import TerminatingEnvironment  # noqa: E402
 
 _CONTROL_TIMESTEP = 0.1  # (Seconds).
 #: Degrees in a radian, MuJoCo's unit.
@@ -84,7 +85,7 @@ def make_environment(
     if "n_sub_steps" not in kwargs:
         kwargs.setdefault("control_timestep", _CONTROL_TIMESTEP)
     # 3 * 0.1 is a little more than 0.3: without rounding that would be a fourth step.
-    return StrikeEnvironment(physics, strike, time_limit=round(time_limit, 6), **kwargs)
+    return TerminatingEnvironment(physics, strike, time_limit=round(time_limit, 6), **kwargs)
 
 
 class Physics(mujoco.Physics):
@@ -263,14 +264,3 @@ class Strike(control.Task):
     def get_termination(self, physics: Physics) -> float | None:
         """Returns a discount of 0 when the ball has been moved."""
         return 0.0 if self._hit else None
-
-
-class StrikeEnvironment(control.Environment):
-    """An `Environment` in which a hit on the last step of the time limit terminates the episode, as on any other step."""
-
-    def step(self, action: Any) -> dm_env.TimeStep:
-        """Updates the environment using the action and returns a `TimeStep`."""
-        time_step = super().step(action)
-        if time_step.last() and self.task.get_termination(self.physics) is not None:
-            return time_step._replace(discount=0.0)
-        return time_step

@@ -24,6 +24,7 @@ from dm_control.suite import base  # noqa: E402
 from dm_control.utils import containers  # noqa: E402
 
 from combrel_envs import mountain_car_scene as scene  # noqa: E402
+from combrel_envs.environment import TerminatingEnvironment  # noqa: E402
 
 SUITE = containers.TaggedTasks()
 
@@ -63,7 +64,7 @@ def make_environment(
     """
     check_number("time_limit", time_limit, "a number of steps above 0", lambda steps: steps > 0)
     task = Climb(start=start, random=random, action_noise=action_noise)
-    return control.Environment(make_physics(n_axes), task, time_limit=time_limit, **(environment_kwargs or {}))
+    return TerminatingEnvironment(make_physics(n_axes), task, time_limit=time_limit, **(environment_kwargs or {}))
 
 
 def make_physics(n_axes: int) -> "Physics":

@@ -401,6 +401,8 @@ class FittedRMaxAgent:
         with self.lock:
             for _, _, reward, _, terminated in transitions:
                 self._note_reward(reward, terminated)
+            # Episodes none of which has come to an end were broken off, as by a time limit.
+            self.rewards.n_truncated += bool(transitions) and not any(terminated for *_, terminated in transitions)
             self._follow_rewards()
             self._take_in_all(transitions)
             self._plan(SWEEPS_AT_EPISODE_END)

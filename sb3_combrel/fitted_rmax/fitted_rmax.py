@@ -32,7 +32,7 @@ from sb3_combrel.fitted_rmax.vec_envs import (
     joined_names,
     names_of,
     periodic_of,
-    refuse_normalized_observations,
+    refuse_running_means,
     true_outcomes,
     warn_of_shared,
 )
@@ -212,7 +212,7 @@ class FittedRMax(PastData):
     def _setup_model(self) -> None:
         self._check_arguments()
         if self.env is not None:
-            refuse_normalized_observations(self.env)
+            refuse_running_means(self.env)
             # Saved with the model, for one that is loaded without an environment.
             self._names = joined_names(self._names, names_of(self.env))
             self.periodic = periodic_of(self.env) if self.periodic is None else self.periodic
@@ -363,6 +363,7 @@ class FittedRMax(PastData):
         for e, choice in enumerate(choices):
             self.agent.update(states[e], choice, raw_rewards[e], next_states[e], terminated[e], e)
             self._episode_rewards[e].append(raw_rewards[e])
+        self._progress.note_step(self.env)
         self._last_obs = new_obs  # type: ignore[assignment]
         self._last_states = self.policy.to_unit(np.asarray(new_obs), note=True) if ended else next_states
         self._last_episode_starts = dones
@@ -374,9 +375,12 @@ class FittedRMax(PastData):
             before = self._episode_num
             for e in ended:
                 self._end_episode(e, terminated[e])
-        if log_interval is not None and self._episode_num // log_interval > before // log_interval:
+        if ended:
+            logs = log_interval is not None and self._episode_num // log_interval > before // log_interval
+            callback.update_locals({"logs": logs})
             callback.on_rollout_end()
-            self.dump_logs()
+            if logs:
+                self.dump_logs()
             callback.on_rollout_start()
         if self.policy.follow_scales(episode_ended=bool(ended)):
             self._last_states = self.policy.to_unit(np.asarray(new_obs))
@@ -432,7 +436,7 @@ class FittedRMax(PastData):
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         given = env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])
-        refuse_normalized_observations(given)
+        refuse_running_means(given)
         joined_names(self._names, names_of(given))
         super().set_env(env, force_reset)
 

@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_combrel.common.scaling import LARGEST_BOUND, StateScaling
 from sb3_combrel.common.user_warnings import warn_user
+from sb3_combrel.fitted_rmax.progress import ProgressWatch
 from sb3_combrel.fitted_rmax.saving import SavedAlgorithm
 from sb3_combrel.sources.experience import KINDS, read_experience, read_named
 from sb3_combrel.sources.source_instances import SourceInstances
@@ -28,6 +29,7 @@ class PastData(SavedAlgorithm):
 
     env: VecEnv | None
     _last_states: np.ndarray | None
+    _progress: ProgressWatch
 
     def load_instances(self, instances: Any, n_instances: int = 1000) -> Self:
         """Take in past transitions of the same task, as if the agent had made them: known at once, and planned with.
@@ -46,7 +48,9 @@ class PastData(SavedAlgorithm):
         :raises ValueError: if they are of another task, by names or numbers of variables and actions, or are damaged; nothing
             is taken in then
         """
-        self.policy.take_in(self._of_this_task(self._read_instances(instances, n_instances)))
+        past = self._of_this_task(self._read_instances(instances, n_instances))
+        self.policy.take_in(past)
+        self._progress.note_ends(past.rewards[past.terminated])
         if self._last_states is not None:
             # A callback has called this: scales may be other ones now.
             self._last_states = self.policy.to_unit(np.asarray(self._last_obs))
@@ -55,7 +59,7 @@ class PastData(SavedAlgorithm):
     def source_instances(self) -> SourceInstances:
         """The experience so far, raw units, in its order; a ValueError if there is none.
 
-        With ``max_instances`` it is what has been kept.
+        With ``max_instances`` it is what has been kept; for observations outside the user's ``bounds`` the nearest inside.
         """
         agent = self.policy.agent
         transitions = agent.model.transitions()
@@ -137,13 +141,15 @@ class PastData(SavedAlgorithm):
                 f"instances must have {task.scaling.n_variables} state variables and at most {task.n_actions} actions, as the "
                 f"task has, got {found.n_variables} {found.state_names} and {found.n_actions} {found.action_names}{other}"
             )
-        if first > 0 and _are_numbered(found.action_names) and found.actions.min() >= first:
+        # What this package has recorded in an environment counts from 0 on.
+        is_recorded = "package" in found.origin
+        if first > 0 and not is_recorded and _are_numbered(found.action_names) and found.actions.min() >= first:
             warn_user(
                 f"the instances have actions from {found.actions.min()} to {found.actions.max()}, which count from 0 on; "
                 f"those of the environment count from {first}: if the instances do so too, subtract that"
             )
         columns = _columns_of_variables(found.state_names, tuple(task.state_names), other)
-        self._check_units(found.states, columns)
+        self._check_units(np.concatenate([found.states, found.next_states]), columns)
         numbers = _numbers_of_actions(found.action_names, tuple(task.action_names), other)
         return replace(
             found,

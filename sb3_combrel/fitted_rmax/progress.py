@@ -4,21 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
+
 from sb3_combrel.common.user_warnings import warn_user
 from sb3_combrel.fitted_rmax.optimism import RewardRange
+from sb3_combrel.fitted_rmax.vec_envs import has_time_limit
 
 # So many episodes in a row are no coincidence.
 IDLE_EPISODES = 3
 EQUAL_RETURNS = 20
+# Longer than the time limits of most tasks.
+MANY_STEPS = 1000
 
 
 class ProgressWatch:
-    """Looks at the episodes of learning, and warns once of each of five things.
+    """Looks at the episodes of learning, and warns once of each of six things.
 
     - A return above ``max_value``: then that is no upper bound, and exploration ends too soon.
     - Episodes that cost nothing: all rewards are 0, and gamma is 1 or ``max_value`` is 0. What is known then keeps the value
       ``max_value`` of what is unknown, and nothing draws the agent to the unknown.
     - Episodes that all end by their time limit, with gamma 1.
+    - No end of an episode, and no time limit that anybody knows of, with gamma 1.
     - Rewards none of which planning tells from 0.
     - Returns that are all exactly alike, at the time limit, while actions are still tried for the first time or nothing has
       told states apart: nothing that exploration reaches makes a difference.
@@ -28,7 +35,7 @@ class ProgressWatch:
         self.rewards, self.tolerance = rewards, float(tolerance)
         self._n_idle = self._n_equal = self._n_optimistic = 0
         self._last_return: float | None = None
-        self._largest, self._n_episodes = 0.0, 0
+        self._largest, self._n_episodes, self._n_steps = 0.0, 0, 0
         self._warned: set[str] = set()
 
     def note(self, rewards: Sequence[float], terminated: bool, n_optimistic_actions: int) -> None:
@@ -45,6 +52,24 @@ class ProgressWatch:
         self._note_size(rewards)
         explored, self._n_optimistic = n_optimistic_actions > self._n_optimistic, n_optimistic_actions
         self._note_return(rewards, terminated, explored)
+
+    def note_step(self, env: VecEnv) -> None:
+        """Look at the number of steps; ``env`` is the environment in which they are made."""
+        self._n_steps += 1
+        if self._n_steps != MANY_STEPS:
+            return
+        seen = self.rewards
+        if seen.gamma == 1.0 and seen.n_ended == seen.n_truncated == 0 and not has_time_limit(env):
+            self._warn(
+                "endless",
+                f"gamma=1, and after {MANY_STEPS} steps no episode has ended: if the task has no end, plans never settle; "
+                "pass gamma=0.99, or gymnasium.wrappers.TimeLimit(env, max_episode_steps=...)",
+            )
+
+    def note_ends(self, rewards: np.ndarray) -> None:
+        """Look at what ends of episodes have paid in past data, shape (n_ends,)."""
+        if len(rewards) > 0:
+            self._note_best_return([float(rewards.max())])
 
     def _note_best_return(self, rewards: Sequence[float]) -> None:
         gamma, max_value = self.rewards.gamma, self.rewards.max_value

@@ -29,9 +29,11 @@ from sb3_combrel.transfer.by_name import check_argument_names, describe_transfer
 # The digits of real numbers hardly compress: higher levels take longer and gain a hundredth.
 COMPRESSION = 1
 
-# Arguments by which what was learned is laid out: another model takes the instances. And those that values depend on.
+# Arguments by which what was learned is laid out: where the layout is another, a new model takes the instances. Those that
+# values depend on, the model does not. And those on which nothing depends that has been computed.
 NOT_TO_CHANGE = {"degree", "max_instances", "model_breadth", "periodic", "resolution", "transfer"}
 OF_VALUES = {"gamma", "max_value"}
+OF_NOTHING = {"max_instances", "planning_tolerance"}
 # The version of a file that names none, as those of other algorithms do not.
 BEFORE = "before 0.2"
 
@@ -114,10 +116,10 @@ class SavedAlgorithm(BaseAlgorithm):
         check_argument_names(cls, kwargs)
         environment = maybe_make_env(env, verbose=0) if isinstance(env, str) else env
         instances = kwargs.pop("instances", None)
-        changed = sorted(kwargs.keys() & NOT_TO_CHANGE)
+        laid_out = sorted(kwargs.keys() & NOT_TO_CHANGE)
         if "seed" in kwargs:
             kwargs["_generator_state"] = None
-        with _naming(path, changed):
+        with _naming(path, laid_out):
             archive = _read(path)
             check_pickles(archive, custom_objects or ())
             model = super().load(
@@ -125,8 +127,11 @@ class SavedAlgorithm(BaseAlgorithm):
             )
         if "transfer" in kwargs:
             _check_same_transfer(model.policy.transfer, archive, path)
-        if kwargs.keys() & OF_VALUES:
-            model.policy.agent.plan_anew()
+        agent, changed = model.policy.agent, _changed_settings(model, archive)
+        if changed - OF_VALUES:
+            agent.rescale(agent.task.scaling, agent.task.shared_scaling)
+        elif changed:
+            agent.plan_anew()
         _check_room(model.policy.agent.model.instances.size, model)
         return model if instances is None else cast(Any, model).load_instances(instances)
 
@@ -166,6 +171,14 @@ class SavedAlgorithm(BaseAlgorithm):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy"], []
+
+
+def _changed_settings(model: Any, archive: io.BytesIO) -> set[str]:
+    """The arguments that are others than those of the model that was saved, and on which what it has computed depends."""
+    with zipfile.ZipFile(archive) as content:
+        saved = json.loads(content.read("data"))
+    names = (name for name in FittedRMaxSettings.names() if name in saved and name not in OF_NOTHING)
+    return {name for name in names if json.dumps(to_plain(getattr(model, name))) != json.dumps(saved[name])}
 
 
 def _check_same_transfer(transfer: Any, archive: io.BytesIO, path: object) -> None:
@@ -229,6 +242,8 @@ def _naming(path: object, changed: Sequence[str] = ()) -> Iterator[None]:
             raise ValueError(f"{path} is a model of another algorithm, of {policy}: load it with its own class") from error
         if "spaces do not match" in str(error) or str(error).startswith("env must have"):
             raise ValueError(f"{path} is a model of another task than env: {error}") from error
+        if "was saved with the transfer method" in str(error):
+            raise ValueError(f"{path}: {error}") from error
         wrong = f"is not the file of a model of FittedRMax, is damaged, or does not fit ({damage_text(error)})"
         if changed:
             wrong += f"; leave out {', '.join(changed)}, or make a new model: FittedRMax(env, instances={str(path)!r}, ...)"

@@ -44,6 +44,8 @@ class FoundScales:
         self._found = ~self._periodic & (bounds is None)
         unbounded = without_bounds(low, high)
         check_periods(self._periodic & unbounded)
+        if bounds is not None:
+            _warn_of_parts_of_periods(space, high - low, self._periodic)
         #: What the space allows, raw units.
         self.low = np.where((low > -LARGEST_BOUND) & (low < high), low, -np.inf)
         self.high = np.where((high < LARGEST_BOUND) & (low < high), high, np.inf)
@@ -215,3 +217,14 @@ class FoundScales:
         # Whatever a file says.
         least, most = np.minimum(low, high), np.maximum(low, high)
         self.scaling = StateScaling(least, np.where(most > least, most, least + 1.0))
+
+
+def _warn_of_parts_of_periods(space: spaces.Space[Any], given: np.ndarray, periodic: np.ndarray) -> None:
+    """Warn of bounds of the user's between which the observation space's range of a periodic variable does not go round."""
+    low, high = StateScaling.limits_of(space)
+    turns = np.where(periodic & ~without_bounds(low, high), (high - low) / given, 1.0)
+    for k in np.flatnonzero(np.abs(turns - np.maximum(1.0, np.round(turns))) > 0.001 * turns).tolist():
+        warn_user(
+            f"bounds of the periodic variable {k} are {given[k]:.4g} apart, which counts as its period, but the observation "
+            f"space has it from {low[k]:.4g} to {high[k]:.4g}: states a period apart are one state; leave out such bounds"
+        )

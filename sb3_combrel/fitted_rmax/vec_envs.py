@@ -69,12 +69,21 @@ def _list_of(env: VecEnv, name: str, *types: type) -> list[Any] | None:
     return None
 
 
-def refuse_normalized_observations(env: VecEnv) -> None:
-    """:raises ValueError: if a ``VecNormalize``, or a ``NormalizeObservation``, normalizes observations by running means"""
+def has_time_limit(env: VecEnv) -> bool:
+    """Whether Gymnasium's wrapper limits the length of episodes."""
+    return any(env.env_is_wrapped(gym.wrappers.TimeLimit))
+
+
+def refuse_running_means(env: VecEnv) -> None:
+    """:raises ValueError: if observations, or rewards but by ``VecNormalize``, are normalized by means that run"""
     normalizer = unwrap_vec_normalize(env)
-    # Rewards are normalized by means of this name as well.
     run = env.has_attr("update_running_mean") and any(env.get_attr("update_running_mean"))
     of_observations = run and any(env.env_is_wrapped(gym.wrappers.NormalizeObservation))
+    if run and any(env.env_is_wrapped(gym.wrappers.NormalizeReward)):
+        raise ValueError(
+            "FittedRMax must have no NormalizeReward whose update_running_mean is True: rewards may have any scale, and means "
+            "that run would mix several in one model; leave it out, or use VecNormalize(norm_obs=False), which is undone"
+        )
     if (normalizer is not None and normalizer.norm_obs) or of_observations:
         raise ValueError(
             "FittedRMax needs VecNormalize(norm_obs=False), and no NormalizeObservation whose update_running_mean is True: "

@@ -21,6 +21,7 @@ from sb3_combrel.common.files import write_whole
 from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.common.scaling import Bounds, StateScaling
 from sb3_combrel.common.serialisation import register_reader, register_writer
+from sb3_combrel.common.user_warnings import warn_user
 from sb3_combrel.sources import minari_datasets, recording, replay_buffers, tables
 from sb3_combrel.sources.q_learning import learn_q_learning
 from sb3_combrel.sources.source_checks import action_array, checked_names, finite_array, terminal_flags
@@ -180,7 +181,10 @@ class SourceInstances:
         """
         n_instances = as_transition_count("n_instances", n_instances)
         check_method(method)
-        return cls(*LEARNERS["fitted_rmax"](env, seed, n_episodes, learner)).subset(n_instances, method, seed)
+        found = cls(*LEARNERS["fitted_rmax"](env, seed, n_episodes, learner))
+        if len(found) < n_instances:
+            warn_user(f"{n_episodes} episodes had {len(found)} steps, fewer than n_instances={n_instances}: raise n_episodes")
+        return found.subset(n_instances, method, seed)
 
     @classmethod
     def from_minari(

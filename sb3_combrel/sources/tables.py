@@ -246,6 +246,18 @@ def _actions(frame: pd.DataFrame, action_names: Sequence[str]) -> np.ndarray:
     as_numbers = pd.to_numeric(column, errors="coerce").to_numpy(dtype=np.float64)
     by_name = {str(name): float(number) for number, name in enumerate(action_names)}
     numbers = np.where(np.isnan(as_numbers), column.astype(str).map(by_name).to_numpy(dtype=np.float64), as_numbers)
+    # Names such as "-1", "0" and "1" are numbers too.
+    values = {float(name): number for name, number in by_name.items() if _is_number(name)}
+    of_values = np.array([values.get(each, np.nan) for each in as_numbers.tolist()])
+    named = np.where(np.isnan(as_numbers), numbers, of_values)
+    if not np.isnan(named).any() and (named != numbers).any():
+        if np.isin(numbers, list(by_name.values())).all():
+            raise ValueError(
+                f"column {ACTION!r} must tell names from numbers, got numbers of actions that are names of others among "
+                f"{list(action_names)}: write names with a letter, or numbers, and read the table without action_names, "
+                "SourceInstances.from_table(table)"
+            )
+        numbers = named
     wrong = np.flatnonzero(~(numbers == np.floor(numbers)) | (numbers < 0.0))
     if len(wrong):
         got = column.tolist()[wrong[0]]
@@ -255,6 +267,13 @@ def _actions(frame: pd.DataFrame, action_names: Sequence[str]) -> np.ndarray:
             f"{did_you_mean(got, by_name)}; continuous actions: write the number of the nearest of those that the agent has"
         )
     return numbers.astype(np.int64)
+
+
+def _is_number(name: str) -> bool:
+    try:
+        return np.isfinite(float(name))
+    except ValueError:
+        return False
 
 
 def as_frame(source: SourceInstances) -> pd.DataFrame:

@@ -20,7 +20,7 @@ from sb3_combrel.common.checks import check_count, check_positive
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
-from sb3_combrel.fitted_rmax.vec_envs import refuse_normalized_observations
+from sb3_combrel.fitted_rmax.vec_envs import refuse_running_means
 from sb3_combrel.pages.plane import VariablePair, check_matplotlib, has_matplotlib, planes_of
 from sb3_combrel.planning.grid import StateGrid
 from sb3_combrel.runs.episodes import EVALUATION_SEED
@@ -153,7 +153,8 @@ class DashboardCallback(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         """Add scalars to the log that the algorithm writes after this."""
-        if self._writer is None:
+        self._log_began = None
+        if self._writer is None or not self.locals["logs"]:
             return
         self.model.logs_statistics = self._of_logs.suffices()
         # The time of a log without these scalars depends on the user's log_interval, and does not count.
@@ -262,7 +263,7 @@ class DashboardCallback(BaseCallback):
         learned, env = self.training_env, self.model._wrap_env(gym.make(given) if isinstance(given, str) else given)
         if _objects_of(env) & _objects_of(learned):
             raise ValueError(f"eval_env must be another environment than the one that is learned, or an id, got {given!r}")
-        refuse_normalized_observations(env)
+        refuse_running_means(env)
         spaces, wanted = ((each.observation_space, each.action_space) for each in (env, learned))
         if spaces != wanted:
             raise ValueError(f"eval_env must have the spaces of the environment that is learned, {wanted}, got {spaces}")

@@ -10,6 +10,7 @@ import numpy as np
 
 from sb3_combrel.common.instances import Instances, along_curve
 from sb3_combrel.common.periodic import differences
+from sb3_combrel.common.user_warnings import warn_user
 from sb3_combrel.mappings.factored_mapping import FactoredMapping
 from sb3_combrel.mappings.inter_task_mapping import MappingNames
 from sb3_combrel.mappings.named_sets import InterTaskMapping, MappingSet, resolve, with_numbers
@@ -214,8 +215,20 @@ def stacked_instances(sources: Sequence[SourceInstances]) -> Instances:
         rows = (source.actions + offset, np.pad(states, padding), np.pad(effects, padding), source.rewards, source.terminated)
         columns.append([column[order] for column in rows])
         offset += source.n_actions
+    _warn_of_broken_angles(sources, periodic)
     actions, starts, moves, rewards, ends = map(np.concatenate, zip(*columns, strict=True))
     return Instances.of_rows(n_actions, actions, starts, moves, rewards, ends, periodic)
+
+
+def _warn_of_broken_angles(sources: Sequence[SourceInstances], periodic: np.ndarray) -> None:
+    """Warn of variables of a source that are periodic, and are not once all sources are together."""
+    broken = [np.array(source.periodic) & ~periodic[: source.n_variables] for source in sources]
+    names = {source.state_names[k] for source, its in zip(sources, broken, strict=True) for k in np.flatnonzero(its).tolist()}
+    if names:
+        warn_user(
+            f"state variables of a source, {', '.join(sorted(names))}, are periodic, and those in the same place of another "
+            "source are not: none of them goes around now; let places of angles agree, or take one source"
+        )
 
 
 def stacked_table(sets: Sequence[MappingSet]) -> MappingTable:

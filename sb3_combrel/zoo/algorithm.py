@@ -8,6 +8,7 @@ from typing import Any, cast
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.common.user_warnings import warn_user
 from sb3_combrel.fitted_rmax.arguments import check_actions
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
@@ -51,7 +52,13 @@ class ZooFittedRMax(FittedRMax):
             changed = with_arguments(self.transfer, self.transfer_kwargs)
             given = cast(Transfer, make_transfer(self.transfer))
             check_argument_names(type(given), self.transfer_kwargs)
-            self.transfer = changed if given.arguments().get("use") == "instances" else self.transfer
+            if given.arguments().get("use") == "instances":
+                self.transfer = changed
+            else:
+                warn_user(
+                    f"what is drawn for {type(given).__name__}, {', '.join(self.transfer_kwargs)}, is not used, as it is of "
+                    'transferred instances: write "use: instances" in the configuration to search it'
+                )
         self.transfer_kwargs = None
         if isinstance(self.resolution, str):
             self.resolution = self._relative_resolution(self.resolution)

@@ -258,6 +258,18 @@ class TestMountainCar:
             assert gymnasium.make(CAR_2D).unwrapped.render() is None
 
 
+def test_a_goal_on_the_last_step_of_the_time_limit_is_an_end():
+    def last(limit):
+        environment = combrel_envs.load("mountain_car", "climb_2d", {"start": "fixed", "random": 0, "time_limit": limit})
+        time_step, n = environment.reset(), 0
+        while not time_step.last():
+            time_step, n = environment.step(2 if time_step.observation["velocity"][0] > 0.0 else 0), n + 1
+        return time_step.discount, n
+
+    discount, n_steps = last(4000)
+    assert discount == 0.0 and last(n_steps) == (0.0, n_steps) and last(n_steps - 1) == (1.0, n_steps - 1)
+
+
 class TestICub:
     @pytest.mark.parametrize(("env_id", "look"), [(TORSO, "primitives"), pytest.param(ARM, "meshes", marks=NO_MESHES)])
     def test_robot_table_ball_and_striking_hand_are_in_the_picture(self, env_id, look):

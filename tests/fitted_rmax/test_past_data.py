@@ -238,7 +238,30 @@ def test_states_in_other_units_are_refused_and_nothing_is_taken_in():
         ValueError, match=r"units of the task, got s0 from -\d\S* to \d\S*; the observation space has it from -1 to 1"
     ):
         fits.load_instances(table.assign(s0=100 * table["s0"]))
+    with pytest.raises(ValueError, match="units of the task, got s0 from -999 to"):
+        fits.load_instances(table.assign(next_s0=table["next_s0"].mask(table["terminated"], -999.0)))
     assert fits.agent.model.n_instances == 0 and not np.isfinite(fits.policy.scales.observed).any()
+
+
+def test_data_without_an_end_are_of_a_task_without_one_as_after_a_time_limit():
+    goes_on, ends = walk_source(), model().load_instances(walk_source())
+    found = model().load_instances(goes_on.to_table().assign(terminated=False))
+    assert (found.agent.rewards.gamma, ends.agent.rewards.gamma) == (0.99, 1.0)
+    found.load_instances(walk_source())
+    assert found.agent.rewards.gamma == found.agent.mdp.gamma == 1.0
+
+
+def test_an_end_that_pays_more_than_max_value_is_told():
+    paid = replace(walk_source(), rewards=np.where(walk_source().terminated, 100.0, -1.0))
+    with pytest.warns(UserWarning, match="a return of 100 was observed"):
+        model(max_value=0.0, gamma=0.99).load_instances(paid)
+
+
+def test_what_was_recorded_where_actions_count_from_1_is_not_suspected(recwarn):
+    model(Walk(first=1)).load_instances(lambda state: 2, 40)
+    assert not [each for each in recwarn if "count from" in str(each.message)]
+    with pytest.warns(UserWarning, match="those of the environment count from 1"):
+        model(Walk(first=1)).load_instances(replace(walk_source(), actions=np.ones(60, dtype=int)))
 
 
 class Doors(gym.Env):

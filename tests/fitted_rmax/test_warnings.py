@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sb3_combrel import FittedRMax
+from sb3_combrel.fitted_rmax.progress import MANY_STEPS
 
 
 class Drift(gym.Env):
@@ -57,6 +58,30 @@ def test_the_share_of_observations_outside_given_bounds_is_said_with_bounds_that
 def test_episodes_that_never_end_are_no_task_for_gamma_1(gamma, warns):
     said = said_by(lambda: FittedRMax(Drift(limit=3), gamma=gamma, bounds=(0.0, 1.0)).learn(80))
     assert any("all 20 episodes have ended by their time limit" in text for text in said) == warns
+
+
+@pytest.mark.parametrize(("limited", "gamma", "warns"), [(False, None, True), (True, None, False), (False, 0.99, False)])
+def test_where_nothing_limits_an_episode_it_is_said_once_it_is_long(limited, gamma, warns):
+    env = Drift(limit=10**9)
+    env = gym.wrappers.TimeLimit(env, 10**6) if limited else env
+    model = FittedRMax(env, gamma=gamma, bounds=(0.0, 1.0), resolution=1)
+    assert not [text for text in said_by(lambda: model.learn(MANY_STEPS - 1)) if "no episode has ended" in text]
+    said = said_by(lambda: model.learn(1, reset_num_timesteps=False))
+    assert any(f"after {MANY_STEPS} steps no episode has ended" in text for text in said) == warns
+
+
+def test_bounds_of_an_angle_are_a_period_apart_or_that_is_told():
+    class Angle(Drift):
+        def __init__(self, turns):
+            super().__init__()
+            self.observation_space = gym.spaces.Box(np.float32([-np.pi * turns]), np.float32([np.pi * turns]))
+
+    def said(turns, *bounds):
+        return said_by(lambda: FittedRMax(Angle(turns), periodic=[True], bounds=bounds))
+
+    assert "apart, which counts as its period" in "".join(said(1, -1.6, 1.6))
+    assert "apart, which counts as its period" in "".join(said(1, -np.pi, 3 * np.pi))
+    assert not said(1, -np.pi, np.pi) and not said(1, 0.0, 2 * np.pi) and not said(10, -np.pi, np.pi)
 
 
 def test_a_file_names_its_version_and_one_of_another_version_that_does_not_fit_says_which_can_load_it(tmp_path):

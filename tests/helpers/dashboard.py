@@ -62,7 +62,8 @@ class Witness(BaseCallback):
         return True
 
     def _on_rollout_end(self):
-        self.seen[self.num_timesteps] = self.of(self.model)
+        if self.locals["logs"]:
+            self.seen[self.num_timesteps] = self.of(self.model)
 
 
 def slow_q(agent, point, action):

@@ -4,7 +4,7 @@ import csv
 
 import pytest
 from helpers.walk import METHODS, Recorder, Walk, same_parameters, small
-from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback, StopTrainingOnMaxEpisodes
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 
@@ -72,6 +72,22 @@ def test_logs_have_the_groups_that_sb3_has_those_of_transfer_only_with_it_and_th
         assert float(row["rollout/ep_rew_mean"]) == -float(row["rollout/ep_len_mean"])
         assert int(float(row["model/instances"])) == int(float(row["time/total_timesteps"]))
         assert abs(sum([float(row[f"model/{name}"]) for name in ("known", "transferred", "optimistic")]) - 1.0) < 1e-5
+
+
+@pytest.mark.parametrize("log_interval", [1, 4, None])
+def test_rollouts_are_episodes_however_often_a_log_is_written(log_interval):
+    class Rollouts(BaseCallback):
+        ended = 0
+
+        def _on_step(self):
+            return True
+
+        def _on_rollout_end(self):
+            self.ended += 1
+
+    callback = Rollouts()
+    model = small().learn(200, callback=callback, log_interval=log_interval)
+    assert callback.ended == model._episode_num > 5
 
 
 def test_without_a_log_interval_nothing_is_logged(tmp_path):

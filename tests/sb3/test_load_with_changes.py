@@ -25,6 +25,20 @@ def test_values_follow_another_gamma_or_bound(file, change):
     assert not np.allclose(values, FittedRMax.load(file).agent.planner.values, atol=0.01)
 
 
+@pytest.mark.parametrize("change", [{"model_breadth": 0.3}, {"min_weight": 0.3}, {"exploration_threshold": 3.0}])
+@pytest.mark.parametrize("how", ["argument", "custom_objects"])
+def test_what_is_known_follows_another_model(file, change, how):
+    loaded = FittedRMax.load(file, **(change if how == "argument" else {"custom_objects": change}))
+    new = small(Walk(limit=100), **change, instances=file)
+    np.testing.assert_array_equal(loaded.agent.model.known, new.agent.model.known)
+    np.testing.assert_allclose(loaded.agent.planner.values, new.agent.planner.values, atol=0.01)
+    assert not np.allclose(loaded.agent.planner.values, FittedRMax.load(file).agent.planner.values, atol=0.01)
+
+
+def test_the_same_arguments_once_more_change_nothing(file):
+    assert same_parameters(FittedRMax.load(file, model_breadth=0.15, resolution=3), FittedRMax.load(file))
+
+
 def test_scales_follow_other_bounds(file):
     bounds = [-1.0, 0.0], [2.0, 2.0]
     loaded, plain = FittedRMax.load(file, env=Walk(), bounds=bounds), FittedRMax.load(file)

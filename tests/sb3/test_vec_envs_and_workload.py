@@ -67,6 +67,14 @@ def test_observations_normalized_by_running_means_are_refused_in_an_environment_
     small(normalized)
 
 
+def test_rewards_normalized_by_running_means_are_refused_where_they_cannot_be_undone():
+    normalized = gym.wrappers.NormalizeReward(Walk())
+    with pytest.raises(ValueError, match="no NormalizeReward"):
+        small(normalized)
+    normalized.update_running_mean = False
+    small(normalized)
+
+
 def test_of_normalized_rewards_the_original_ones_are_stored(tmp_path):
     env = VecNormalize(VecMonitor(DummyVecEnv([Walk])), norm_obs=False, norm_reward=True)
     recorder = Recorder()

@@ -137,6 +137,26 @@ def test_a_misspelt_action_name_is_named():
         SourceInstances.from_table(frame, action_names=("left", "right"))
 
 
+FORCES = ("-1", "0", "1")
+
+
+@pytest.mark.parametrize(
+    ("column", "numbers"),
+    [([-1, 0, 1], [0, 1, 2]), (["-1", "0", "1"], [0, 1, 2]), ([0, 1, 2], [0, 1, 2]), ([0.0, -1.0, 0.0], [1, 0, 1])],
+)
+def test_names_that_are_numbers_are_told_from_numbers_of_actions(column, numbers):
+    frame = pd.DataFrame({"x": [0.0, 1.0, 2.0], "action": column, "reward": -1.0, "next_x": 1.0, "terminated": False})
+    assert SourceInstances.from_table(frame, action_names=FORCES).actions.tolist() == numbers
+
+
+@pytest.mark.parametrize("column", [[0, 1, 1], ["0", "1", "0"]])
+def test_where_they_may_be_either_it_is_said(column):
+    frame = pd.DataFrame({"x": [0.0, 1.0, 2.0], "action": column, "reward": -1.0, "next_x": 1.0, "terminated": False})
+    with pytest.raises(ValueError, match="column 'action' must tell names from numbers"):
+        SourceInstances.from_table(frame, action_names=FORCES)
+    assert SourceInstances.from_table(frame, action_names=("0", "1")).actions.tolist() == [int(each) for each in column]
+
+
 @pytest.mark.parametrize("content", [b"", b"\x00\xff\xfe\x80abc", b'a,b\n"1,2\n3'])
 def test_a_file_that_is_no_table_is_refused(tmp_path, content):
     (tmp_path / "log.csv").write_bytes(content)

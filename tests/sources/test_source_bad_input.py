@@ -6,7 +6,7 @@ import re
 import gymnasium as gym
 import numpy as np
 import pytest
-from helpers.walk import walk_source
+from helpers.walk import Walk, walk_source
 
 from sb3_combrel import COMBREL, SourceInstances
 from sb3_combrel.sources.q_learning import QLearning
@@ -109,6 +109,23 @@ def test_whole_floats_are_counts():
     learned = SourceInstances.from_q_learning(TASK, 5.0, seed=0, total_timesteps=1e2)
     assert learned.origin["total_timesteps"] == 100
     np.testing.assert_array_equal(learned.states, SourceInstances.from_q_learning(TASK, 5, 0, total_timesteps=100).states)
+
+
+class Endless(Walk):
+    """The walk, whose end is a wall."""
+
+    def step(self, action):
+        observation, reward, _, truncated, info = super().step(action)
+        return observation, reward, False, truncated, info
+
+
+def test_a_source_task_without_an_end_is_refused_and_one_with_few_steps_is_told(monkeypatch):
+    monkeypatch.setattr("sb3_combrel.fitted_rmax.source_learner.LONGEST_EPISODE", 50)
+    with pytest.raises(ValueError, match=r"none has ended for 50 steps: wrap it in gymnasium\.wrappers\.TimeLimit"):
+        SourceInstances.from_fitted_rmax(Endless(limit=10**9), n_episodes=2, seed=0)
+    with pytest.warns(UserWarning, match=r"2 episodes had \d+ steps, fewer than n_instances=500"):
+        found = SourceInstances.from_fitted_rmax(Walk(), 500, n_episodes=2, seed=0)
+    assert 2 <= len(found) <= 60
 
 
 def test_a_method_of_choice_that_does_not_exist_is_refused_before_learning():

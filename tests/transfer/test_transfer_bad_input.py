@@ -27,6 +27,7 @@ class Untouched(Env):
     step = reset
 
 
+TURNS = (True, False)
 OF_A_PRIOR, TWO = f.oscillator_source(60), f.copies_mapping(2)
 METHODS = [COMBREL, TIMBREL]
 
@@ -263,3 +264,13 @@ def test_timbrel_without_a_mapping_is_warned_of():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         TIMBREL(walk_source(), "random")
+
+
+def test_angles_that_another_source_has_not_are_told():
+    walk = walk_source()
+    angles, others = (dataclasses.replace(walk, periodic=flags, state_names=("angle", "mass")) for flags in (TURNS, ()))
+    with pytest.warns(UserWarning, match="state variables of a source, angle, are periodic, and those in the same place"):
+        small(transfer=COMBREL([angles, others]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        small(transfer=COMBREL([angles, angles]))

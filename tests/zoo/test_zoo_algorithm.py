@@ -72,7 +72,8 @@ def test_what_a_study_draws_replaces_what_the_configuration_says(algo, source):
 def test_a_study_leaves_a_prior_as_the_configuration_has_it(given, source):
     drawn = ALGORITHMS["combrel"](optuna.create_study().ask(), 2, 1, {})
     entry = {"policy": "FittedRMaxPolicy", **drawn, "transfer": {"sb3_combrel.COMBREL": {"source": source, **given}}}
-    transfer = ZooFittedRMax(env=gym.make(CAR), **{**entry, "resolution": 1}).transfer
+    with pytest.warns(UserWarning, match='what is drawn for COMBREL, .*, is not used.*"use: instances"'):
+        transfer = ZooFittedRMax(env=gym.make(CAR), **{**entry, "resolution": 1}).transfer
     assert transfer.use == "prior" and transfer.n_neighbors == 3
 
 

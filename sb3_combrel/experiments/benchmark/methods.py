@@ -226,7 +226,8 @@ def method_of(text: str) -> Method:
         return replace(found, digest=digest)
     if inspect.isabstract(found):
         raise ValueError(f"methods: {text} lacks {', '.join(sorted(found.__abstractmethods__))}, which a transfer method has")
-    description = (inspect.getdoc(found) or "").partition("\n")[0]
+    # A class without a docstring would inherit its parent's.
+    description = inspect.cleandoc(getattr(found, "__doc__", None) or "").partition("\n")[0]
     if isinstance(found, type) and issubclass(found, Transfer):
         make: Any = found
         return _finding(name, description, lambda sources, pair: make(sources), digest=digest)

@@ -141,11 +141,10 @@ def rank_table(methods: Sequence[Method], cells: Cells, compared: Scores) -> Tab
         tested = [of_pair[name] for of_pair in compared.values() if name in of_pair and not np.isnan(of_pair[name].p_value)]
         differs = [each for each in tested if each.p_value < ALPHA]
         better = sum(each.better for each in differs)
-        interval = _EMPTY if np.isnan(rank.low) else f"{rank.low:.1f} to {rank.high:.1f}"
         against = (str(better), str(len(differs) - better)) if tested else (_EMPTY, _EMPTY)
-        rows.append((name, f"{rank.rank:.2f}", interval, str(rank.n_pairs), *against))
-    rows += [(method.name, "", "", "0", "", "") for method in methods if method.name not in found]
-    header = ("method", "mean rank", "95% interval", "pairs", "better than none", "worse than none")
+        rows.append((name, f"{rank.rank:.2f}", str(rank.n_pairs), *against))
+    rows += [(method.name, "", "0", "", "") for method in methods if method.name not in found]
+    header = ("method", "mean rank", "pairs", "better than none", "worse than none")
     return Table(f"Mean rank over pairs, and in how many a method differs from none (p < {ALPHA:g})", header, rows)
 
 

@@ -23,7 +23,6 @@ from sb3_combrel.comparison.statistics import (
     holm,
     interquartile_mean,
     p_value_of_difference,
-    resampled,
 )
 from sb3_combrel.experiments.benchmark.methods import NONE, Method, run_as
 from sb3_combrel.experiments.benchmark.pair import Pair
@@ -162,56 +161,32 @@ def ranks(performance: Mapping[str, np.ndarray], cells: Mapping[str, Cell]) -> d
 
 
 class MeanRank(NamedTuple):
-    """The mean rank of a method over ``n_pairs`` pairs, and its 95% bootstrap interval, NaN where a pair has too few runs."""
+    """The mean rank of a method over ``n_pairs`` pairs."""
 
     rank: float
-    low: float
-    high: float
     n_pairs: int
 
 
 def mean_ranks(
-    performance: Mapping[str, Mapping[str, np.ndarray]],
-    cells: Mapping[str, Mapping[str, Cell]],
-    n_resamples: int = 2000,
-    seed: int = 0,
+    performance: Mapping[str, Mapping[str, np.ndarray]], cells: Mapping[str, Mapping[str, Cell]]
 ) -> dict[str, MeanRank]:
-    """Average the ranks of each method over pairs, with bootstrap intervals.
+    """Average the ranks of each method over pairs.
 
-    In each draw the runs of every pair and method are drawn with replacement, and ranked anew. A method is ranked in the pairs
-    where it has runs, among the methods that have. So that places in pairs with many and with few methods count alike, ranks
-    are stretched to the number of methods of the pair that has most: the best has 1, the last that number. Methods whose runs
-    are the same count as one.
+    A method is ranked in the pairs where it has runs, among the methods that have. So that places in pairs with many and with
+    few methods count alike, ranks are stretched to the number of methods of the pair that has most: the best has 1, the last
+    that number. Methods whose runs are the same count as one. There is no interval: ranks of runs that are drawn with
+    replacement are drawn to the middle, and their percentiles hardly ever have the true rank of the best and of the last.
     """
-    rng = np.random.default_rng(seed)
-    distinct = {pair: _distinct(of_methods, cells[pair]) for pair, of_methods in performance.items()}
-    most = max(map(len, distinct.values()), default=0)
-    observed: dict[str, list[float]] = {}
-    drawn: dict[str, list[np.ndarray]] = {}
-    for pair, of_pair in distinct.items():
-        means = [np.array([interquartile_mean(each)]) for each in of_pair.values()]
-        draws = [resampled((each,), interquartile_mean, n_resamples, rng) for each in of_pair.values()]
-        enough = min(map(len, of_pair.values()), default=0) >= FEWEST_RUNS
-        of_means, of_draws = (dict(zip(of_pair, _stretched(each, most), strict=True)) for each in (means, draws))
-        for name in performance[pair]:
-            runs_of = cells[pair][name].run_as
-            observed.setdefault(name, []).append(float(of_means[runs_of][0]))
-            drawn.setdefault(name, []).append(of_draws[runs_of] if enough else np.full(n_resamples, np.nan))
-    found = {}
-    for name, of_pairs in observed.items():
-        low, high = np.percentile(np.mean(drawn[name], axis=0), (2.5, 97.5)).tolist()
-        found[name] = MeanRank(float(np.mean(of_pairs)), low, high, len(of_pairs))
-    return found
+    n_ranked = {pair: len(_distinct(of_methods, cells[pair])) for pair, of_methods in performance.items()}
+    most = max(n_ranked.values(), default=0)
+    found: dict[str, list[float]] = {}
+    for pair, of_methods in performance.items():
+        stretch = (most - 1.0) / (n_ranked[pair] - 1.0) if n_ranked[pair] > 1 else 0.0
+        for name, rank in ranks(of_methods, cells[pair]).items():
+            found.setdefault(name, []).append(1.0 + (rank - 1.0) * stretch)
+    return {name: MeanRank(float(np.mean(of_pairs)), len(of_pairs)) for name, of_pairs in found.items()}
 
 
 def _distinct(performance: Mapping[str, np.ndarray], cells: Mapping[str, Cell]) -> dict[str, np.ndarray]:
     """The performance by whose runs it is: of methods whose runs are the same, once."""
     return {cells[name].run_as: its_own for name, its_own in performance.items()}
-
-
-def _stretched(means: Sequence[np.ndarray], most: int) -> np.ndarray:
-    """Ranks of the methods in each draw, from 1 to ``most``; ``means``: of each method, shape (n_draws,)."""
-    if not means:
-        return np.zeros((0, 0))
-    found = stats.rankdata(-np.array(means), axis=0)
-    return np.ones_like(found) if len(found) < 2 else 1.0 + (found - 1.0) * (most - 1.0) / (len(found) - 1.0)

@@ -136,20 +136,8 @@ class TestRanks:
                 mine = naive_iqm(of_methods[method])
                 places.append(1 + sum(naive_iqm(other) > mine for other in of_methods.values()))
             assert found[method].rank == pytest.approx(np.mean(places)) and found[method].n_pairs == 2
-            assert 1.0 <= found[method].low <= found[method].high <= 3.0
-        # Every draw hands out all places.
+        # All places are taken.
         assert sum(each.rank for each in found.values()) == pytest.approx(6.0)
-
-    def test_the_interval_covers_what_draws_of_runs_give(self):
-        pair, cells = cells_by({"a": 0.0, "b": 0.1}, n_seeds=4)
-        performance = performances(pair, cells)
-        found = mean_ranks({"made-up": performance}, {"made-up": cells}, n_resamples=20_000)
-        # All draws of four runs of each.
-        draws = [np.array([naive_iqm(d) for d in itertools.product(performance[name], repeat=4)]) for name in "ab"]
-        assert 0.025 < np.mean(draws[0][:, None] < draws[1]) < 0.975, "the example must be undecided"
-        assert (found["a"].low, found["a"].high) == (1.0, 2.0)
-        sure = mean_ranks({"made-up": {"a": performance["a"] - 9.0, "b": performance["b"]}}, {"made-up": cells})
-        assert (sure["a"].rank, sure["a"].low, sure["a"].high) == (2.0, 2.0, 2.0)
 
     def test_where_cells_are_empty_ranks_are_stretched(self):
         cells = {
@@ -162,11 +150,6 @@ class TestRanks:
             "b": (1.5, 2),
             "c": (1.0, 1),
         }
-
-    def test_with_too_few_runs_in_a_pair_there_is_no_interval(self):
-        pair, cells = cells_by({"a": 0.0, "b": 1.0}, n_seeds=2)
-        found = mean_ranks({"made-up": performances(pair, cells)}, {"made-up": cells})
-        assert np.isnan(found["a"].low) and np.isnan(found["a"].high) and found["a"].rank in (1.0, 2.0)
 
 
 LEVELS = {NONE: 0.0, "a": 5.0, "b": 0.1, "c": -5.0}
