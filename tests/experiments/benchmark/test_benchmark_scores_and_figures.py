@@ -12,6 +12,7 @@ from sb3_combrel.comparison.statistics import holm
 from sb3_combrel.experiments.benchmark import report
 from sb3_combrel.experiments.benchmark.figures import WINDOW, _by_episodes, _by_steps, draw_pair
 from sb3_combrel.experiments.benchmark.methods import METHODS, NONE, Method
+from sb3_combrel.experiments.benchmark.methods import method_of as named_method
 from sb3_combrel.experiments.benchmark.pair import Pair
 from sb3_combrel.experiments.benchmark.runs import jobs_of
 from sb3_combrel.experiments.benchmark.scores import (
@@ -295,6 +296,19 @@ def test_a_method_whose_name_is_no_file_name_is_refused():
 def test_each_method_of_the_package_says_what_it_is():
     assert next(iter(METHODS)) == NONE
     assert all(method.description and name == method.name for name, method in METHODS.items())
+
+
+def test_a_method_of_ones_own_is_described_by_its_own_words_alone(tmp_path):
+    lines = [
+        "from sb3_combrel import COMBREL",
+        "class Silent(COMBREL):",
+        "    pass",
+        "class Said(COMBREL):",
+        '    """What."""',
+    ]
+    (tmp_path / "own.py").write_text("\n".join(lines))
+    found = [named_method(f"{tmp_path / 'own.py'}:{name}") for name in ("Silent", "Said")]
+    assert [method.description for method in found] == ["", "What."]
 
 
 # Curves over environment steps and episodes, against naive computations.
