@@ -363,7 +363,6 @@ class FittedRMax(PastData):
         for e, choice in enumerate(choices):
             self.agent.update(states[e], choice, raw_rewards[e], next_states[e], terminated[e], e)
             self._episode_rewards[e].append(raw_rewards[e])
-        self._progress.note_step(self.env)
         self._last_obs = new_obs  # type: ignore[assignment]
         self._last_states = self.policy.to_unit(np.asarray(new_obs), note=True) if ended else next_states
         self._last_episode_starts = dones
@@ -375,6 +374,7 @@ class FittedRMax(PastData):
             before = self._episode_num
             for e in ended:
                 self._end_episode(e, terminated[e])
+        self._progress.note_step(self.env)
         if ended:
             logs = log_interval is not None and self._episode_num // log_interval > before // log_interval
             callback.update_locals({"logs": logs})
