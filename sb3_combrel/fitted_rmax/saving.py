@@ -173,18 +173,22 @@ class SavedAlgorithm(BaseAlgorithm):
         return ["policy"], []
 
 
+def _attributes_in(archive: io.BytesIO) -> dict[str, Any]:
+    """What Stable-Baselines3 has written of a model's attributes, as JSON has it."""
+    with zipfile.ZipFile(archive) as content:
+        return dict(json.loads(content.read("data")))
+
+
 def _changed_settings(model: Any, archive: io.BytesIO) -> set[str]:
     """The arguments that are others than those of the model that was saved, and on which what it has computed depends."""
-    with zipfile.ZipFile(archive) as content:
-        saved = json.loads(content.read("data"))
+    saved = _attributes_in(archive)
     names = (name for name in FittedRMaxSettings.names() if name in saved and name not in OF_NOTHING)
     return {name for name in names if json.dumps(to_plain(getattr(model, name))) != json.dumps(saved[name])}
 
 
 def _check_same_transfer(transfer: Any, archive: io.BytesIO, path: object) -> None:
     """:raises ValueError: if a method, once it is bound, is not the one that was saved, as far as that is described"""
-    with zipfile.ZipFile(archive) as content:
-        saved = json.loads(content.read("data")).get("transfer")
+    saved = _attributes_in(archive).get("transfer")
     if not isinstance(saved, dict) or saved.get("arguments") is None:
         return
     if json.dumps(describe_transfer(transfer), sort_keys=True) != json.dumps(saved, sort_keys=True):

@@ -42,7 +42,7 @@ class _RefuseEndless(BaseCallback):
         self._last_end = self.num_timesteps
 
     def _on_step(self) -> bool:
-        if self.num_timesteps - self._last_end >= LONGEST_EPISODE:
+        if self.num_timesteps - self._last_end > LONGEST_EPISODE:
             raise ValueError(
                 f"the source's environment must end its episodes, none has ended for {LONGEST_EPISODE} steps: wrap it in "
                 "gymnasium.wrappers.TimeLimit(env, max_episode_steps=...)"

@@ -78,16 +78,12 @@ def refuse_running_means(env: VecEnv) -> None:
     """:raises ValueError: if observations, or rewards but by ``VecNormalize``, are normalized by means that run"""
     normalizer = unwrap_vec_normalize(env)
     run = env.has_attr("update_running_mean") and any(env.get_attr("update_running_mean"))
-    of_observations = run and any(env.env_is_wrapped(gym.wrappers.NormalizeObservation))
-    if run and any(env.env_is_wrapped(gym.wrappers.NormalizeReward)):
+    wrappers = gym.wrappers.NormalizeObservation, gym.wrappers.NormalizeReward
+    if (normalizer is not None and normalizer.norm_obs) or (run and any(any(env.env_is_wrapped(each)) for each in wrappers)):
         raise ValueError(
-            "FittedRMax must have no NormalizeReward whose update_running_mean is True: rewards may have any scale, and means "
-            "that run would mix several in one model; leave it out, or use VecNormalize(norm_obs=False), which is undone"
-        )
-    if (normalizer is not None and normalizer.norm_obs) or of_observations:
-        raise ValueError(
-            "FittedRMax needs VecNormalize(norm_obs=False), and no NormalizeObservation whose update_running_mean is True: "
-            "it scales observations itself, and means that run would move them under a model that has learned"
+            "FittedRMax needs VecNormalize(norm_obs=False), whose rewards it undoes, and no NormalizeObservation and no "
+            "NormalizeReward whose update_running_mean is True: it scales observations itself, takes rewards of any size, and "
+            "means that run would move both under a model that has learned"
         )
 
 

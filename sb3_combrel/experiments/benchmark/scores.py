@@ -174,8 +174,8 @@ def mean_ranks(
 
     A method is ranked in the pairs where it has runs, among the methods that have. So that places in pairs with many and with
     few methods count alike, ranks are stretched to the number of methods of the pair that has most: the best has 1, the last
-    that number. Methods whose runs are the same count as one. There is no interval: ranks of runs that are drawn with
-    replacement are drawn to the middle, and their percentiles hardly ever have the true rank of the best and of the last.
+    that number. Methods whose runs are the same count as one. There is no interval: to draw runs with replacement adds to
+    their noise, which pulls ranks to the middle.
     """
     n_ranked = {pair: len(_distinct(of_methods, cells[pair])) for pair, of_methods in performance.items()}
     most = max(n_ranked.values(), default=0)
