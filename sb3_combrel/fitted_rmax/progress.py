@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import accumulate
 
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
@@ -19,7 +20,7 @@ MANY_STEPS = 1000
 
 
 class ProgressWatch:
-    """Looks at the episodes of learning, and warns once of each of six things.
+    """Looks at the episodes of learning, and warns once of each of seven things.
 
     - A return above ``max_value``: then that is no upper bound, and exploration ends too soon.
     - Episodes that cost nothing: all rewards are 0, and gamma is 1 or ``max_value`` is 0. What is known then keeps the value
@@ -29,12 +30,14 @@ class ProgressWatch:
     - Rewards none of which planning tells from 0.
     - Returns that are all exactly alike, at the time limit, while actions are still tried for the first time or nothing has
       told states apart: nothing that exploration reaches makes a difference.
+    - Returns, discounted, that are all exactly alike from the first episode on, however they end, while actions are tried.
     """
 
     def __init__(self, rewards: RewardRange, tolerance: float):
         self.rewards, self.tolerance = rewards, float(tolerance)
         self._n_idle = self._n_equal = self._n_optimistic = 0
         self._last_return: float | None = None
+        self._first_return, self._all_alike, self._has_explored = np.nan, True, False
         self._largest, self._n_episodes, self._n_steps = 0.0, 0, 0
         self._warned: set[str] = set()
 
@@ -52,6 +55,7 @@ class ProgressWatch:
         self._note_size(rewards)
         explored, self._n_optimistic = n_optimistic_actions > self._n_optimistic, n_optimistic_actions
         self._note_return(rewards, terminated, explored)
+        self._note_all(rewards, explored)
 
     def note_step(self, env: VecEnv) -> None:
         """Look at the number of steps; ``env`` is the environment in which they are made."""
@@ -73,10 +77,7 @@ class ProgressWatch:
 
     def _note_best_return(self, rewards: Sequence[float]) -> None:
         gamma, max_value = self.rewards.gamma, self.rewards.max_value
-        best, value = -float("inf"), 0.0
-        for reward in reversed(rewards):
-            value = reward + gamma * value
-            best = max(best, value)
+        best = max(_discounted(rewards, gamma))
         if best > max_value + 1e-6 * max(1.0, abs(max_value)):
             advice = "pass a larger max_value"
             if self.rewards.finds_max_value and gamma == 1.0:
@@ -136,7 +137,28 @@ class ProgressWatch:
                 "longer time limit, exploration gets farther",
             )
 
+    def _note_all(self, rewards: Sequence[float], explored: bool) -> None:
+        if self._n_episodes > EQUAL_RETURNS or not self._all_alike:
+            return
+        value = _discounted(rewards, self.rewards.gamma)[-1]
+        if self._n_episodes == 1:
+            self._first_return = value
+        self._all_alike, self._has_explored = value == self._first_return, self._has_explored or explored
+        if self._n_episodes == EQUAL_RETURNS and self._all_alike and self._has_explored and "equal" not in self._warned:
+            self._warn(
+                "alike",
+                f"all {EQUAL_RETURNS} episodes so far have the same return, {value:g} (discounted with gamma="
+                f"{self.rewards.gamma:g}), though the agent has tried other actions: nothing that it did has made a difference. "
+                "Unless a goal is still to be found, look at the task's rewards and ends; where a goal is to be reached soon, "
+                "a gamma below 1 makes a difference, such as gamma=0.99",
+            )
+
     def _warn(self, of: str, message: str) -> None:
         if of not in self._warned:
             self._warned.add(of)
             warn_user(message)
+
+
+def _discounted(rewards: Sequence[float], gamma: float) -> list[float]:
+    """The discounted returns from each step of an episode on, that of the last step first."""
+    return list(accumulate(reversed(rewards), lambda value, reward: reward + gamma * value))
