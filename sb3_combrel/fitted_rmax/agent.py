@@ -421,7 +421,7 @@ class FittedRMaxAgent:
             self._take_in(state, action, reward, next_state, terminated)
             if terminated:
                 self._method.end_episode(truncated=False)
-        self._outdated = [self.model.outdated()]
+        self._outdated.append(self.model.outdated())
 
     @property
     def _lines_move(self) -> bool:
@@ -484,7 +484,7 @@ class FittedRMaxAgent:
         if learned:
             self._method.set_state(learned)
             self._method.sample_moved()
-        self._widen(min(0.0, lowest) / LONGEST_PLAN)
+        self.planner.bounds = (min(self.planner.bounds[0], lowest), self.planner.bounds[1])
 
         def moved(state: np.ndarray) -> np.ndarray:
             return scaling.to_unit(before.to_raw(state))
@@ -526,6 +526,7 @@ class FittedRMaxAgent:
     ) -> None:
         """Take over what :meth:`get_state` returned, in unit coordinates of ``scaling``, in place of what was learned."""
         with self.lock:
+            generator = self.rng.bit_generator.state
             self.task = self.task if scaling is None else replace(self.task, scaling=scaling, bounds=bounds)
             self.rewards.set_state(state["rewards"])
             self.grid, self._lines_due = self.grid.with_lines(state["lines"]), int(state["lines_due"][0])
@@ -542,6 +543,8 @@ class FittedRMaxAgent:
             self._search()
             self.promises.restore(state["promises"])
             self.has_acted, self._cautious = bool(state["has_acted"][0] > 0.5), None
+            # What a method draws once more is no part of learning on.
+            self.rng.bit_generator.state = generator
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name != "lock"}

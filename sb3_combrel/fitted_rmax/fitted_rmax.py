@@ -231,6 +231,8 @@ class FittedRMax(PastData):
             **{**self._names, **self.policy_kwargs},
         )
         if self._generator_state is not None and self._prediction_state is not None:
+            # A method may have drawn something when it was bound.
+            self._rng.bit_generator.state = self._generator_state
             self.agent.prediction_rng.bit_generator.state = self._prediction_state
         self._generator_state = self._prediction_state = None
         self.policy = self.policy.to(self.device)

@@ -162,11 +162,13 @@ class GridModel(Model):
         if not terminated or self.settings.ends_by_action:
             return due
         self._renew_ends()
-        # What is known of ends concerns all actions that may lead there.
-        arrived, noted = self.arrivals.state[action, slot], [due]
+        return np.union1d(due, self._note_end(action, slot))
+
+    def _note_end(self, action: int, slot: int) -> np.ndarray:
+        """Note that an instance has ended an episode, or that it counts no more: pairs of all actions that may lead there."""
+        arrived, numbers = self.arrivals.state[action, slot].copy(), self._measured[2]
         widest = (self.grid.diagonal + float(np.linalg.norm(self.instances.effect[action, slot]))) ** 2
-        noted += [self._note((arrived, *numbers_and_size), other, widest, ENDED) for other in range(self.n_actions)]
-        return np.unique(np.concatenate(noted))
+        return np.concatenate([self._note((arrived, numbers, numbers), a, widest, ENDED) for a in range(self.n_actions)])
 
     def _inform(self, reward: float, terminated: bool, due: np.ndarray) -> np.ndarray:
         """Note an outcome; with the first that differs grid points need less weight: the pairs that are due."""
@@ -200,6 +202,7 @@ class GridModel(Model):
             if instances.terminated[action, slot]:
                 instances.terminated[action, slot] = False
                 self._renew_ends()
+                removed = np.union1d(removed, self._note_end(action, slot))
             return slot, removed
         if size == instances.capacity:
             self._make_room(size + 1)
@@ -294,3 +297,12 @@ class GridModel(Model):
             self._put((action, int(self.instances.size[action]), at, at, float(row[-3]), bool(row[-2] > 0.5)), effect)
         self.n_added = n_added
         self._put_in_order(state["instances"])
+        if self.pairs.item.size:
+            self._rename_kept()
+
+    def _rename_kept(self) -> None:
+        """Let the lists of pairs name slots as they are: in the replay these were in order of time."""
+        items = self.pairs.item.reshape(self.n_actions, self.grid.n_points, -1)
+        for action in np.flatnonzero(self.instances.size):
+            slots = np.argsort(self._number[action, : self.instances.size[action]])
+            items[action] = slots[items[action]]

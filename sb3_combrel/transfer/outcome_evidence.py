@@ -17,7 +17,7 @@ from sb3_combrel.transfer.report import MIN_IN_PART, Contradiction
 ENDS, GOES_ON = 0.5, 0.1
 STEPS_OF_A_VISIT = 10  # so many steps in a row where an end is predicted, and none comes, contradict it once
 # What is counted, in the order in which it is saved.
-COUNTS = ("confirmed", "unpredicted", "absent", "rewards_right", "rewards_wrong", "steps_of_visit")
+COUNTS = ("confirmed", "unpredicted", "absent", "rewards_right", "rewards_wrong")
 TRANSITIONS_BEFORE_WARNING = 300  # transitions from which on predictions worse than "no change" are warned of
 N_PARTS = 4  # each state variable's range is divided into so many parts
 MAX_CONTRADICTIONS = 8
@@ -102,7 +102,7 @@ class OutcomeEvidence:
         return self.unpredicted + self.absent
 
     def get_state(self) -> np.ndarray:
-        """What was counted, float64, shape (8,); of several environments the visit of the last one."""
+        """What was counted, float64, shape (7,)."""
         counts = [getattr(self, name) for name in COUNTS]
         return np.array([*counts, *np.clip(self.reward_range, -1e300, 1e300)], dtype=np.float64)
 
@@ -111,6 +111,15 @@ class OutcomeEvidence:
         for name, value in zip(COUNTS, state.tolist(), strict=False):
             setattr(self, name, int(value))
         self.reward_range = float(state[-2]), float(state[-1])
+
+    @property
+    def visits(self) -> np.ndarray:
+        """Each environment that is where an end is predicted, and its steps there; float64, shape (n, 2)."""
+        return np.array([visit for visit in self._visits.items() if visit[1]], dtype=np.float64).reshape(-1, 2)
+
+    @visits.setter
+    def visits(self, rows: np.ndarray) -> None:
+        self._visits = {int(environment): int(steps) for environment, steps in rows}
 
 
 class RegionErrors:

@@ -264,3 +264,49 @@ def test_an_environment_with_its_variables_in_another_order_is_another_one(tmp_p
     model.save(tmp_path / "model")
     with pytest.raises(ValueError, match="is a model of another task than env: env must have the state_names"):
         FittedRMax.load(tmp_path / "model", env=Swapped())
+
+
+def test_lists_of_pairs_name_their_instances_after_loading_as_well(tmp_path):
+    model = small(transfer=COMBREL(walk_source()), max_instances=20).learn(150)
+    model.save(tmp_path / "model")
+    agent = FittedRMax.load(tmp_path / "model").agent
+    instances, pairs, points = agent.model.instances, agent.model.pairs, agent.grid.points()
+    fitted = np.flatnonzero(agent.model.known & (pairs.n_new == 0))
+    assert instances.size.max() == 20 and len(fitted) > 40
+    for pair in fitted:
+        action, point = divmod(int(pair), agent.grid.n_points)
+        distance = ((instances.state[action, : instances.size[action]] - points[point]) ** 2).sum(axis=1)
+        listed = distance[pairs.item[pair, : pairs.length[pair]]]
+        np.testing.assert_allclose(listed, np.sort(distance)[: len(listed)], rtol=1e-9)
+
+
+@pytest.mark.parametrize("use", ["prior", "instances"])
+def test_a_mapping_that_is_drawn_once_more_takes_no_random_number_from_learning(tmp_path, use):
+    model = small(transfer=TIMBREL(walk_source(), "random", use=use)).learn(60)
+    model.save(tmp_path / "model")
+    loaded = FittedRMax.load(tmp_path / "model")
+    assert loaded.agent.rng.bit_generator.state == model.agent.rng.bit_generator.state
+
+
+def test_how_low_values_may_get_does_not_depend_on_how_often_all_is_computed_anew():
+    agent = small(max_value=-50.0, gamma=0.9).learn(40).agent
+    bounds = agent.planner.bounds
+    for _ in range(3):
+        agent.rescale(agent.task.scaling, agent.task.shared_scaling)
+    assert agent.planner.bounds == bounds and bounds[0] < -50.0
+
+
+def test_pairs_of_all_actions_hear_of_an_end_that_counts_no_more():
+    agent = make_agent(1, 2, max_instances=20)
+    for action in (1, 0):
+        for x in np.linspace(0.6, 0.85, 20):
+            ends = action == 0 and x > 0.84
+            agent.update(np.array([x]), action, -100.0 if ends else -1.0, np.array([x + 0.05]), bool(ends))
+    rewards = agent.mdp.arrays.reward.T.ravel()
+    near = np.flatnonzero(agent.model.known & np.isfinite(rewards) & (rewards < -10.0))
+    assert len(near[near >= agent.grid.n_points]) > 0
+    agent.update(np.array([0.85]), 0, -1.0, np.array([0.9]), False)
+    assert len(agent.model.ends.state) == 0
+    still = near[agent.model.known[near]]
+    assert len(still[still >= agent.grid.n_points]) > 0
+    np.testing.assert_allclose(agent.mdp.arrays.reward.T.ravel()[still], -1.0)

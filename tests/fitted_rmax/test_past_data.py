@@ -367,3 +367,13 @@ def test_a_buffer_that_forgets_where_episodes_ended_is_refused():
     buffer.add(at, at, np.array([[1]]), np.array([-1.0]), np.array([False]), [{}])
     with pytest.raises(ValueError, match="optimize_memory_usage"):
         model().load_instances(buffer)
+
+
+def test_a_discount_that_past_data_change_is_that_of_every_row():
+    learned = model().learn(20)
+    assert learned.agent.mdp.gamma == 1.0
+    learned.load_instances(walk_source().to_table().assign(terminated=False).head(1))
+    rows, gamma = learned.agent.mdp.arrays, learned.agent.mdp.gamma
+    used = np.arange(rows.weight.shape[2]) < rows.length[..., None]
+    assert gamma == 0.99 and rows.modelled.sum() > 50
+    assert np.where(used, rows.weight, 0.0).sum(axis=2).max() <= gamma + 1e-12

@@ -80,3 +80,22 @@ def test_visits_are_those_of_each_environment():
     assert evidence.absent == 2
     evidence.note((0.0, -1.0), -1.0, True)
     assert (evidence.unpredicted, evidence.confirmed) == (1, 0)
+
+
+def test_visits_that_go_on_are_restored_to_their_environments():
+    evidence, restored = (OutcomeEvidence(np.full(10, -1.0)) for _ in range(2))
+    for environment, steps in ((2, 4), (0, 0), (1, 3)):
+        evidence.environment = environment
+        for _ in range(steps):
+            evidence.note((1.0, -1.0), -1.0, False)
+    restored.set_state(evidence.get_state())
+    restored.visits = evidence.visits
+    for each in (evidence, restored):
+        each.environment = 0
+        each.note((0.0, -1.0), -1.0, False)
+        each.environment = 2
+        each.note((1.0, -1.0), -1.0, True)
+        each.environment = 1
+        each.note((0.0, -1.0), -1.0, False)
+    assert evidence.confirmed == 1 and evidence.absent == 1
+    np.testing.assert_array_equal(restored.get_state(), evidence.get_state())

@@ -185,6 +185,7 @@ class InstanceTransfer:
             "uses": uses,
             "instances_used": np.array([float(self._instances_used)]),
             "check": self.check.get_state(),
+            "visits": self.check.evidence.visits,
             "errors": np.concatenate([[float(self.n_observed)], self.errors.sums.ravel()]),
             **({"relevance_of": np.array([float(self._n_of_relevance)])} if self._by_relevance else {}),
             **self.selector.get_state(),
@@ -198,6 +199,7 @@ class InstanceTransfer:
         self._uses = Counter(dict(zip(used.tolist(), state["uses"][used].astype(np.int64).tolist(), strict=True)))
         self._instances_used = int(state["instances_used"][0])
         self.check.set_state(state["check"])
+        self.check.evidence.visits = state["visits"]
         self.n_observed = int(state["errors"][0])
         self.errors.sums.ravel()[:] = state["errors"][1:]
         if self._by_relevance:

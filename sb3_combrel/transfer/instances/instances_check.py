@@ -106,7 +106,7 @@ class InstancesCheck:
         return wrong / baseline if baseline > 0.0 else np.nan
 
     def get_state(self) -> np.ndarray:
-        """What was found so far, float64, shape (16,)."""
+        """What was found so far, but for the visits that go on, float64, shape (15,)."""
         figures = *self._sums, self.n_compared, *self._used_up, self._in_vain, self._n_before, self._warned
         return np.concatenate([np.array(figures, dtype=np.float64), self.evidence.get_state()])
 
