@@ -18,13 +18,38 @@ ROUNDING = 1e-6
 
 
 def with_own_arrays(env: Any) -> Any:
+    """An environment in :class:`OwnArrays`; a vectorised one stays as it is, and one whose observations are no arrays."""
+    is_one = isinstance(env, gym.Env) and isinstance(env.observation_space, spaces.Box)
+    return OwnArrays(env) if is_one else env
+
+
+class OwnArrays(gym.Wrapper[Any, Any, Any, Any]):
     """An environment whose observations are copies: some return one array, and change it at the next step or reset.
 
-    A vectorised one stays as it is, and one whose observations are no arrays.
+    It refuses what Stable-Baselines3 would take for something else without a word: an observation of another shape, which is
+    repeated until it fits, and text, which counts as true.
     """
-    if not isinstance(env, gym.Env) or not isinstance(env.observation_space, spaces.Box):
-        return env
-    return gym.wrappers.TransformObservation(env, np.array, env.observation_space)
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        """:raises ValueError: if the observation has another shape than its space"""
+        observation, info = self.env.reset(**options)
+        return self._own(observation), info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """:raises ValueError: the same; or if reward, terminated or truncated is text"""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        for name, value in (("reward", reward), ("terminated", terminated), ("truncated", truncated)):
+            if isinstance(value, str):
+                wanted = "a number" if name == "reward" else "True or False"
+                raise ValueError(f"step must return {name} as {wanted}, not as text, got {value!r}")
+        return self._own(observation), reward, terminated, truncated, info
+
+    def _own(self, observation: Any) -> np.ndarray:
+        copied = np.array(observation)
+        if copied.shape != self.observation_space.shape:
+            wanted = f"the shape {self.observation_space.shape} of env.observation_space"
+            raise ValueError(f"an observation must have {wanted}, got {observation!r}")
+        return copied
 
 
 @entry_point

@@ -182,5 +182,8 @@ def check_bounds(bounds: Bounds, n_variables: int) -> Limits:
         if not np.all(np.isfinite(bound)):
             raise ValueError(wrong.format(f"a {name} of {bound.tolist()} in bounds={bounds!r}"))
     low, high = np.broadcast_to(low, n_variables), np.broadcast_to(high, n_variables)
+    if n_variables == 2 and not (low < high).all() and low[0] < low[1] and high[0] < high[1]:
+        by_variable = list(zip(low.tolist(), high.tolist(), strict=True))
+        raise ValueError(wrong.format(f"a pair for each variable, bounds={bounds!r}: pass bounds={by_variable}"))
     _check_order(low, high, "bounds")
     return low, high

@@ -302,6 +302,10 @@ def check_methods(methods: Any, baseline: Any) -> str:
     for name, transfer in methods.items():
         if not (transfer is None or isinstance(transfer, Transfer | dict | str)):
             raise ValueError(f"methods must be transfer methods or None for no transfer, got {transfer!r} for {name!r}")
+        if isinstance(transfer, dict) and (len(transfer) != 1 or not isinstance(next(iter(transfer.values())), dict | None)):
+            wanted = 'a method\'s name and its arguments, {"COMBREL": {"source": "source.npz"}}'
+            other = "; arguments of the learner are those of compare, and the same for all methods"
+            raise ValueError(f"a dict in methods must be {wanted}, got {transfer!r} for {name!r}{other}")
     if baseline is None:
         without = [name for name, transfer in methods.items() if transfer is None]
         if len(without) != 1:

@@ -18,6 +18,7 @@ import numpy as np
 
 from sb3_combrel.common.checks import check_resolution
 from sb3_combrel.common.constants import (
+    BEYOND,
     COARSE,
     LINES_AGAIN,
     LONGEST_PLAN,
@@ -29,6 +30,7 @@ from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task
 from sb3_combrel.common.transferred import TransferredInstances
+from sb3_combrel.common.user_warnings import warn_user
 from sb3_combrel.fitted_rmax.correspondence import Correspondence, NoTransfer, OfLearner
 from sb3_combrel.fitted_rmax.optimism import RewardRange, worth_after_visits
 from sb3_combrel.fitted_rmax.promises import Promises
@@ -388,9 +390,22 @@ class FittedRMaxAgent:
 
         :param state: unit coordinates, shape (n_variables,)
         :return: shape (n_actions,)
+        :raises ValueError: if the state has another shape, or is not finite
         """
+        state = np.ascontiguousarray(state, dtype=np.float64)
+        if state.shape != (self.grid.n_variables,) or not np.isfinite(state).all():
+            raise ValueError(f"state must be {self.grid.n_variables} finite numbers, got {state.tolist()}")
+        beyond = np.abs(state - np.clip(state, 0.0, 1.0))
+        if beyond[~self.grid.arrays.periodic].max(initial=0.0) > BEYOND:
+            warn_user(
+                f"the state {state.tolist()} is outside what has been seen, which is 0 to 1 in unit coordinates; of an "
+                "observation, ask q_values(model.policy.to_unit(observation))"
+            )
+        return self._q_values(state)
+
+    def _q_values(self, state: np.ndarray) -> np.ndarray:
         with self.lock:
-            self._evaluate(np.ascontiguousarray(state, dtype=np.float64))
+            self._evaluate(state)
             return self._q.q.copy()
 
     def take_in(self, transitions: Sequence[Transition]) -> None:
@@ -437,7 +452,7 @@ class FittedRMaxAgent:
         if not self._lines_move or (n := self.model.n_instances) < self._lines_due:
             return
         states, values = [state for state, *_ in self.model.transitions()[n // 2 :]], self.planner.values
-        errors = [abs(self.grid.interpolate(values, state) - self.q_values(state).max()) for state in states]
+        errors = [abs(self.grid.interpolate(values, state) - self._q_values(state).max()) for state in states]
         if max(errors) > 0.0:
             lines = moved_lines(self.grid, np.array(states), np.array(errors))
             self.rescale(self.task.scaling, self.task.shared_scaling, lines)

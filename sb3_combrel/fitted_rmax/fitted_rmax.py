@@ -36,6 +36,7 @@ from sb3_combrel.fitted_rmax.vec_envs import (
     true_outcomes,
     warn_of_shared,
 )
+from sb3_combrel.sources.transitions import full_id
 from sb3_combrel.transfer.base import Transfer
 from sb3_combrel.transfer.by_name import make_transfer, restore_transfer
 
@@ -177,7 +178,7 @@ class FittedRMax(PastData):
         policy_class, environment = policy_and_env(policy, env, self.policy_aliases)
         super().__init__(
             policy_class,
-            environment,
+            full_id(environment),
             learning_rate=0.0,
             policy_kwargs=policy_kwargs,
             stats_window_size=int(stats_window_size) if isinstance(stats_window_size, np.integer) else stats_window_size,
@@ -307,9 +308,12 @@ class FittedRMax(PastData):
         self._refuse_changes()
         if self.env is None:
             raise ValueError("there is no environment to learn from: call set_env(env) first, or load(..., env=env)")
-        run_name = self._run_name() if tb_log_name is None else tb_log_name
+        # By its own name: callbacks look for it among the locals.
+        tb_log_name = self._run_name() if tb_log_name is None else tb_log_name
         begins_anew = reset_num_timesteps or self._last_obs is None
-        total_timesteps, callback = self._setup_learn(total_timesteps, callback, reset_num_timesteps, run_name, progress_bar)
+        total_timesteps, callback = self._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
         callback.on_training_start(locals(), globals())
         callback.on_rollout_start()
         self._episode_rewards = [[] for _ in range(self.n_envs)]

@@ -143,7 +143,8 @@ class PastData(SavedAlgorithm):
             )
         # What this package has recorded in an environment counts from 0 on.
         is_recorded = "package" in found.origin
-        if first > 0 and not is_recorded and _are_numbered(found.action_names) and found.actions.min() >= first:
+        fits_both = first != 0 and found.actions.min() >= first and found.actions.max() < first + task.n_actions
+        if fits_both and not is_recorded and _are_numbered(found.action_names):
             warn_user(
                 f"the instances have actions from {found.actions.min()} to {found.actions.max()}, which count from 0 on; "
                 f"those of the environment count from {first}: if the instances do so too, subtract that"

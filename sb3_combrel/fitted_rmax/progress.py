@@ -145,12 +145,13 @@ class ProgressWatch:
             self._first_return = value
         self._all_alike, self._has_explored = value == self._first_return, self._has_explored or explored
         if self._n_episodes == EQUAL_RETURNS and self._all_alike and self._has_explored and "equal" not in self._warned:
+            gamma = self.rewards.gamma
+            sooner = "; with gamma=1 it does not matter how soon an end pays, as it does with gamma=0.99"
             self._warn(
                 "alike",
-                f"all {EQUAL_RETURNS} episodes so far have the same return, {value:g} (discounted with gamma="
-                f"{self.rewards.gamma:g}), though the agent has tried other actions: nothing that it did has made a difference. "
-                "Unless a goal is still to be found, look at the task's rewards and ends; where a goal is to be reached soon, "
-                "a gamma below 1 makes a difference, such as gamma=0.99",
+                f"all {EQUAL_RETURNS} episodes so far have the same return, {value:g} (discounted with gamma={gamma:g}), "
+                "though the agent has tried other actions: nothing that it did has made a difference. Unless something is yet "
+                f"to be found, look at the task's rewards and ends{sooner if gamma == 1.0 else ''}",
             )
 
     def _warn(self, of: str, message: str) -> None:

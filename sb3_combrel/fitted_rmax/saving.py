@@ -24,6 +24,7 @@ from sb3_combrel.common.version import __version__
 from sb3_combrel.fitted_rmax.policies import FittedRMaxPolicy
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 from sb3_combrel.fitted_rmax.unpickling import check_pickles
+from sb3_combrel.sources.transitions import full_id
 from sb3_combrel.transfer.by_name import check_argument_names, describe_transfer
 
 # The digits of real numbers hardly compress: higher levels take longer and gain a hundredth.
@@ -71,7 +72,10 @@ class SavedAlgorithm(BaseAlgorithm):
         :param exclude: names of attributes that are excluded as well
         :param include: names of excluded attributes that are included
         :raises OSError: if the file cannot be written
+        :raises ValueError: if ``path`` is neither of these
         """
+        if not (Path(path).name if isinstance(path, str | Path) else hasattr(path, "write")):
+            raise ValueError(f"path must be the name of a file, or an open file, got {path!r}")
         written, archive = copy.copy(self), io.BytesIO()
         for name in (*FittedRMaxSettings.names(), "seed"):
             setattr(written, name, to_plain(getattr(self, name)))
@@ -114,7 +118,7 @@ class SavedAlgorithm(BaseAlgorithm):
         :raises ValueError: if the file is damaged, was not saved by this class, or does not fit the other arguments
         """
         check_argument_names(cls, kwargs)
-        environment = maybe_make_env(env, verbose=0) if isinstance(env, str) else env
+        environment = maybe_make_env(full_id(env), verbose=0) if isinstance(env, str) else env
         instances = kwargs.pop("instances", None)
         laid_out = sorted(kwargs.keys() & NOT_TO_CHANGE)
         if "seed" in kwargs:

@@ -51,4 +51,4 @@ class _RefuseEndless(BaseCallback):
 
 
 LEARNERS["fitted_rmax"] = learn_fitted_rmax
-READERS["fitted_rmax"] = lambda file: FittedRMax.load(file).source_instances()
+READERS["fitted_rmax"] = lambda file: FittedRMax.load(file, verbose=0).source_instances()

@@ -16,7 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import TwoSlopeNorm, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, NullLocator
 
 from sb3_combrel.pages.palette import ACTION_COLOURS, MAPPING_COLOURS, NONE_COLOUR, colour
 from sb3_combrel.pages.plane import Plane
@@ -165,7 +165,7 @@ def label_plane(axes: Axes, plane: Plane, title: str) -> None:
     axes.tick_params(labelsize=FONT_SIZE - 1, pad=2)
     # Most of the time that a picture takes is spent on ticks.
     axes.xaxis.set_major_locator(MaxNLocator(3))
-    axes.yaxis.set_major_locator(MaxNLocator(3))
+    axes.yaxis.set_major_locator(MaxNLocator(3) if plane.names[1] else NullLocator())
     axes.label_outer()
 
 

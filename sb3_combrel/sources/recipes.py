@@ -26,7 +26,7 @@ from sb3_combrel.common.scaling import has_bounds
 from sb3_combrel.common.suggestions import did_you_mean
 from sb3_combrel.sources.experience import KINDS, find_file, read_experience, read_file, read_named
 from sb3_combrel.sources.source_instances import SourceInstances
-from sb3_combrel.sources.transitions import LEARNERS, make_env
+from sb3_combrel.sources.transitions import LEARNERS, full_id, make_env
 
 #: What a source may be given as, see :func:`find_source`; a Minari dataset as well.
 OneSource: TypeAlias = (
@@ -220,7 +220,7 @@ def _add_modules(name: str, package: str, modules: set[str]) -> None:
 
 def task_spec(name: str) -> EnvSpec | None:
     """The environment of an id, or None; a module before a colon is imported first, as by ``gymnasium.make``."""
-    module, _, env_id = f"combrel_envs:{name}".rpartition(":") if name.startswith("combrel/") else name.rpartition(":")
+    module, _, env_id = full_id(name).rpartition(":")
     try:
         if module:
             importlib.import_module(module)

@@ -264,7 +264,8 @@ def _actions(frame: pd.DataFrame, action_names: Sequence[str]) -> np.ndarray:
         names = f", or one of {list(action_names)}" if len(action_names) else ""
         raise ValueError(
             f"column {ACTION!r} must be whole numbers from 0 on{names}, got {got!r} in row {frame.index[wrong[0]]}"
-            f"{did_you_mean(got, by_name)}; continuous actions: write the number of the nearest of those that the agent has"
+            f"{did_you_mean(got, by_name)}; where those of an environment begin elsewhere, subtract its action_space.start; "
+            "continuous actions: write the number of the nearest of those that the agent has"
         )
     return numbers.astype(np.int64)
 

@@ -135,10 +135,13 @@ def limits_of_task(env: VecEnv, bounds: Bounds | None) -> Limits:
 
 
 def make_env(env: str | gym.Env[Any, Any]) -> gym.Env[Any, Any]:
-    """The environment of an id, or the one given; ids of this project's environments need no import of ``combrel_envs``."""
-    if not isinstance(env, str):
-        return env
-    return gym.make(f"combrel_envs:{env}" if env.startswith("combrel/") else env)
+    """The environment of an id, see :func:`full_id`, or the one given."""
+    return gym.make(full_id(env)) if isinstance(env, str) else env
+
+
+def full_id(env: Any) -> Any:
+    """An id with its module, as this project's environments need no import of ``combrel_envs`` then; or what else is given."""
+    return f"combrel_envs:{env}" if isinstance(env, str) and env.startswith("combrel/") else env
 
 
 def task_names(env: AnyEnv) -> dict[str, tuple[Any, ...]]:

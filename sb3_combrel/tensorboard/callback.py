@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_combrel.common.checks import check_count, check_positive
 from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.common.user_warnings import warn_user
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
 from sb3_combrel.fitted_rmax.fitted_rmax import FittedRMax
 from sb3_combrel.fitted_rmax.vec_envs import refuse_running_means
@@ -120,6 +121,7 @@ class DashboardCallback(BaseCallback):
     def _on_training_start(self) -> None:
         self._writer = tensorboard_writer(self.logger)
         if self._writer is None:
+            warn_user("DashboardCallback does nothing without a TensorBoard log: pass the model tensorboard_log='logs'")
             return
         if self.picture_freq is not None:
             check_matplotlib("pass picture_freq=None")

@@ -81,7 +81,7 @@ def explain(
 def _load(path: Path) -> FittedRMax:
     if not path.exists() and not path.with_name(path.name + ".zip").exists():
         raise FileNotFoundError(f"there is no model file {path}, looked for in {Path.cwd()}; write one with: model.save(path)")
-    return FittedRMax.load(path)
+    return FittedRMax.load(path, verbose=0)
 
 
 def _save_pictures(agent: FittedRMaxAgent, planes: Sequence[Plane], folder: Path) -> None:

@@ -6,6 +6,7 @@ import copy
 import importlib
 import inspect
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 from sb3_combrel.common.serialisation import KIND, from_plain, to_plain
@@ -16,6 +17,8 @@ from sb3_combrel.transfer.base import Transfer
 SAVED = "transfer"
 PACKAGE = __name__.partition(".")[0]
 METHODS = f"{PACKAGE}.transfer.methods."
+# Of files that are sources.
+SUFFIXES = (".npz", ".csv", ".zip")
 
 
 def make_transfer(transfer: Transfer | type[Transfer] | dict[str, Any] | str | None) -> Transfer | None:
@@ -71,7 +74,9 @@ def _method(name: str) -> Any:
     except (ImportError, AttributeError, ValueError) as error:
         close = did_you_mean(attribute, [each.rpartition(".")[2] for each in own])
         known = ", ".join(sorted(own))
-        raise ValueError(f"transfer names {name!r}, which does not exist; known are {known}{close}") from error
+        is_file = Path(name).suffix in SUFFIXES or Path(name).is_file()
+        hint = f"; a file is the source of a method, transfer=COMBREL({name!r})" if is_file else close
+        raise ValueError(f"transfer names {name!r}, which is no transfer method; known are {known}{hint}") from error
 
 
 def describe_transfer(transfer: Transfer | None) -> dict[str, Any] | None:

@@ -221,7 +221,7 @@ NO_MAPPING = "The source is taken for nothing: no mapping explains the target be
 _FIGURES = ("compliance", "next best", "no change", "error", "next best's", "strength", "no source")
 _EXPLANATIONS = {
     "compliance": "Compliance: how well the mapping predicts the target's own transitions, 1 is exact; of the next best, and "
-    'of "no change".',
+    'of "no change". Where strength is shown, the likelihood of all transitions decides, and the next best may have more.',
     "error": 'Error: squared, of predicted effects, over that of "no change"; below 1 is better than that.',
     "strength": "Strength: as how many of the target's own instances the source counts where it has data. No source: how "
     "probable it is that these alone predict better.",

@@ -61,6 +61,7 @@ def test_a_space_that_is_unbounded_or_as_large_as_the_largest_float_needs_bounds
     [
         *[(7, "got bounds=7"), ((0,), r"got bounds=\(0,\)"), (([0, 1, 2], 3), r"low of shape \(3,\)")],
         *[((0, 0), "low=0.0 and high=0.0 for variable 0"), (([0, 2], [1, 1]), "low=2.0 and high=1.0 for variable 1")],
+        ([(-1, 3), (0, 2)], r"got a pair for each variable, .*: pass bounds=\[\(-1.0, 0.0\), \(3.0, 2.0\)\]"),
         *[((np.nan, 1), "low of nan"), ((0, np.inf), "high of inf"), (([0, "a"], 3), "got bounds=")],
     ],
 )

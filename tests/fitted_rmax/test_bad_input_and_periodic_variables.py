@@ -1,6 +1,8 @@
 """Arguments, environments and observations that cannot work are refused in time, with an error that names what to change."""
 
 import re
+import subprocess
+import sys
 import warnings
 
 import gymnasium as gym
@@ -332,3 +334,41 @@ def test_a_plane_through_the_end_of_a_periodic_variable_goes_through_its_beginni
     grid, scaling = StateGrid(3, 2, 0, (True, False, False)), StateScaling([0.0] * 3, [1.0] * 3)
     plane = plane_through(grid, scaling, ("a", "b", "c"), (1, 2), at=[0.99, 0.5, 0.5])
     assert plane.held == "a = 0" and (grid.states_of(plane.points.ravel())[:, 0] == 0.0).all()
+
+
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        (lambda *step: (step[0][:1], *step[1:]), r"an observation must have the shape \(2,\) of env.observation_space, got"),
+        (lambda *step: (step[0], "-1", *step[2:]), "step must return reward as a number, not as text, got '-1'"),
+        (
+            lambda *step: (*step[:2], "False", *step[3:]),
+            "step must return terminated as True or False, not as text, got 'False'",
+        ),
+    ],
+)
+def test_what_would_be_taken_for_something_else_is_refused(returned, message):
+    class Wrong(Scripted):
+        def step(self, action):
+            return returned(*super().step(action))
+
+    with pytest.raises(ValueError, match=message):
+        FittedRMax(Wrong(), seed=0).learn(5)
+
+
+def test_an_observation_of_another_shape_is_refused_at_once():
+    env = gym.wrappers.TransformObservation(Scripted(), lambda observation: observation[:1], Scripted().observation_space)
+    with pytest.raises(ValueError, match="an observation must have the shape"):
+        FittedRMax(env, seed=0).learn(5)
+
+
+def test_environments_of_the_project_need_no_import():
+    code = "from sb3_combrel import FittedRMax; print(FittedRMax('combrel/MountainCar2D-v0', seed=0).agent.task.state_names)"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "x" in found.stdout
+
+
+@pytest.mark.parametrize("path", ["", 3, None])
+def test_what_cannot_be_a_file_to_save_to_is_refused_by_name(path):
+    with pytest.raises(ValueError, match=re.escape(f"path must be the name of a file, or an open file, got {path!r}")):
+        small().save(path)

@@ -262,6 +262,8 @@ def test_what_was_recorded_where_actions_count_from_1_is_not_suspected(recwarn):
     assert not [each for each in recwarn if "count from" in str(each.message)]
     with pytest.warns(UserWarning, match="those of the environment count from 1"):
         model(Walk(first=1)).load_instances(replace(walk_source(), actions=np.ones(60, dtype=int)))
+    with pytest.warns(UserWarning, match="actions from 0 to 0, .*; those of the environment count from -1"):
+        model(Walk(first=-1)).load_instances(replace(walk_source(), actions=np.zeros(60, dtype=int)))
 
 
 class Doors(gym.Env):

@@ -1,6 +1,7 @@
 """Q at exact states against its definition, through the agent."""
 
 import copy
+import warnings
 
 import numpy as np
 import pytest
@@ -195,3 +196,17 @@ def test_an_evaluation_takes_a_known_end_that_is_worth_as_much_as_optimism(line_
     for _ in range(3):
         agent.update(HERE, 1, 0.0, np.array([0.32]), True)
     assert agent.q_values(HERE)[1] == 0.0 == agent.planner.bounds[1] and agent.act(HERE, explore=False) == 1
+
+
+def test_a_state_that_cannot_be_one_is_refused_and_one_in_raw_units_warned_of(line_agent):
+    agent = line_agent()
+    for wrong in ([0.1, 0.2], [[0.5]], [np.nan]):
+        with pytest.raises(ValueError, match="state must be 1 finite numbers, got"):
+            agent.q_values(wrong)
+    with pytest.warns(
+        UserWarning, match=r"outside what has been seen, .*model.policy.to_unit\(observation\)"
+    ):
+        agent.q_values([-0.5])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        agent.q_values([1.0])

@@ -116,3 +116,16 @@ def test_tensorboard_logs_are_named_after_algorithm_transfer_method_and_seed(met
 def test_verbose_learning_logs_to_the_screen(capsys):
     small(verbose=1).learn(60, log_interval=1)
     assert "ep_rew_mean" in capsys.readouterr().out
+
+
+def test_callbacks_are_told_the_name_of_the_run():
+    class Name(BaseCallback):
+        def _on_step(self):
+            self.name = self.locals["tb_log_name"]
+            return False
+
+    callback = Name()
+    small().learn(5, callback=callback)
+    assert callback.name == "FittedRMax_seed0"
+    small().learn(5, callback=callback, tb_log_name="mine")
+    assert callback.name == "mine"

@@ -119,6 +119,10 @@ def test_what_is_written_as_a_table_is_read_again(n, d, n_actions, seed):
         ({"x": [0.0, np.nan, 0.2, 0.3, 0.4]}, "'x' must be finite numbers, got nan in row 1"),
         ({"x": [0.0, "wall", 0.2, 0.3, 0.4]}, "'x' must be finite numbers, got 'wall' in row 1"),
         ({"action": [0, 1, 0.5, 1, 1]}, "'action' must be whole numbers from 0 on, got 0.5 in row 2"),
+        (
+            {"action": [0, 1, -1, 1, 1]},
+            "got -1 in row 2; where those of an environment begin elsewhere, subtract",
+        ),
         ({"action": [0, -1, 0, 1, 1]}, "got -1 in row 1"),
         ({"terminated": ["no", "no", "yes", "no", "no"]}, "'terminated' must be true or false, got 'no' in row 0"),
         ({"next_x": None, "next_v": None}, "terminates in row 2 arrived"),

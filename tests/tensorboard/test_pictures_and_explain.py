@@ -5,6 +5,7 @@ import pytest
 from helpers.command_line import call_for_all_output
 from helpers.dashboard import METHODS, NamedWalk, Still, events, run_folder, slow_q, walker
 from helpers.own_method import Mine
+from helpers.walk import Walk
 from matplotlib.image import imread
 
 from sb3_combrel import COMBREL, FittedRMax, SourceInstances, explain
@@ -103,6 +104,9 @@ def test_the_first_two_variables_are_drawn_by_default_or_the_only_one(tmp_path):
     FittedRMax(Still(np.float32([0]), np.float32([1])), seed=0, tensorboard_log=str(tmp_path)).learn(50, DashboardCallback())
     assert events(run_folder(tmp_path)).Tags()["images"] == ["value_and_policy/s0"]
     assert numbered(None, ("a",)) == [(0, 0)]
+    agent = FittedRMax(Still(np.float32([0]), np.float32([1])), seed=0).agent
+    panels = value_figure(snapshot_of(agent), plane_through(agent.grid, agent.task.scaling, ("a",), (0, 0)), WIDTH).axes
+    assert len(panels[0].get_xticks()) > 1 and len(panels[0].get_yticks()) == 0
 
 
 def test_source_actions_are_those_of_the_chosen_mappings(learnt):
@@ -246,3 +250,15 @@ def test_what_is_to_be_drawn_needs_a_folder(drawn):
     [name] = drawn
     with pytest.raises(ValueError, match=rf"output must be a folder where {name}=.* says what is drawn, got None"):
         explain(walker().learn(20), **drawn)
+
+
+def test_a_file_of_a_talkative_model_is_explained_without_its_talk(tmp_path, capsys):
+    FittedRMax(Walk(), resolution=3, model_breadth=0.15, verbose=1).learn(20).save(tmp_path / "model")
+    capsys.readouterr()
+    explain(tmp_path / "model")
+    assert capsys.readouterr().out == ""
+
+
+def test_a_dashboard_without_a_log_says_that_it_does_nothing():
+    with pytest.warns(UserWarning, match="does nothing without a TensorBoard log: pass the model tensorboard_log='logs'"):
+        walker().learn(20, callback=DashboardCallback())

@@ -43,10 +43,15 @@ def test_a_name_that_is_wrong_is_refused_with_those_that_are_known():
     public = [each for each in sb3_combrel.__all__ if isinstance(getattr(sb3_combrel, each), type)]
     methods = [each for each in public if issubclass(getattr(sb3_combrel, each), Transfer)]
     for wrong, close in {"MASTERR": "MASTER", "nowhere.COMBREL": "COMBREL", "sb3_combrel.COMBRELL": "COMBREL", "": ""}.items():
-        with pytest.raises(ValueError, match=f"{wrong!r}, which does not exist; known are") as error:
+        with pytest.raises(ValueError, match=f"{wrong!r}, which is no transfer method; known are") as error:
             make_transfer({wrong: {}})
         known = ", ".join(f"sb3_combrel.{each}" for each in sorted(methods))
         assert str(error.value).endswith(known + (f"; did you mean {close!r}?" if close else ""))
+
+
+def test_a_file_in_place_of_a_method_is_told_to_be_its_source():
+    with pytest.raises(ValueError, match=r"the source of a method, transfer=COMBREL\('steps/source.npz'\)$"):
+        make_transfer("steps/source.npz")
 
 
 @pytest.mark.parametrize(
