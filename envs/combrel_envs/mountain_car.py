@@ -88,10 +88,6 @@ class Physics(mujoco.Physics):
         """Returns the car's velocity on each axis."""
         return self.data.qvel.copy()
 
-    def push(self) -> np.ndarray:
-        """Returns what the engine does on each axis: -1, 0 or 1."""
-        return self.data.ctrl.copy()
-
     def at_goal(self) -> bool:
         """Returns whether the car is at the goal."""
         return dynamics.at_goal(tuple(self.data.qpos.tolist()))

@@ -129,8 +129,7 @@ def end_at(state, near, outcome_breadth, arrivals, ends, found):
 
 @compiled
 def weigh_ends(state, of_end, nearest, outcome_breadth, arrivals, found):
-    """:func:`end_at` where the squared distances of the nearest end and of the nearest arrival are known."""
-    found[0], found[1] = 0.0, 0.0
+    """:func:`end_at` where the squared distances of the nearest end and of the nearest arrival are known; ``found`` is 0."""
     reach = reach_of(nearest, outcome_breadth)
     if of_end > reach:
         return

@@ -188,7 +188,7 @@ class TestPhysics:
         state = physics.get_state()
         physics.set_control([1.0, 0.0])
         physics.step(10)
-        assert physics.push().tolist() == [1.0, 0.0] and physics.time() == 10
+        assert physics.control().tolist() == [1.0, 0.0] and physics.time() == 10
         physics.set_state(state)
         assert physics.car_position().tolist() == [0.1, -0.2] and physics.car_velocity().tolist() == [0.03, 0.04]
 
