@@ -58,7 +58,7 @@ def test_an_observation_that_is_not_finite_is_named(learner, good_steps, observa
         learner(Faulty(good_steps, observation=observation))
 
 
-@pytest.mark.parametrize("reward", ["much", [1.0, 2.0], INF, NAN])
+@pytest.mark.parametrize("reward", [[1.0, 2.0], INF, NAN])
 def test_a_reward_that_is_no_number_is_named(reward):
     says = "the environment returned a reward that is not a finite number, in"
     with pytest.raises(ValueError, match=f"{says} step 3 of episode 1"):
@@ -66,6 +66,12 @@ def test_a_reward_that_is_no_number_is_named(reward):
     # Vectorised environments keep rewards in an array of numbers.
     with pytest.raises(ValueError, match=f"{says} transition 2" if isinstance(reward, float) else None):
         record(Faulty(3, reward=reward))
+
+
+@pytest.mark.parametrize("learner", [record, learn_by_q_learning])
+def test_a_reward_that_is_text_is_named(learner):
+    with pytest.raises(ValueError, match="step must return reward as a number, not as text, got 'much'"):
+        learner(Faulty(3, reward="much"))
 
 
 def test_q_learning_names_rewards_that_its_values_cannot_represent():
