@@ -15,6 +15,8 @@ from sb3_combrel.common.checks import check_count
 
 # What a cosine or a sine may exceed 1 by: bounds are often float32.
 _ROUNDING = 1e-3
+# By so much the squares of a cosine and a sine may differ from 1, for noisy sensors.
+_NO_ANGLE = 0.2
 
 # Pairs of the environments whose layout is known, and the names of the variables that result.
 _KNOWN: tuple[tuple[type[gym.Env[Any, Any]], int, tuple[tuple[int, int], ...], tuple[str, ...]], ...] = (
@@ -40,7 +42,8 @@ class AngleObservation(
     :param env: an environment whose observations are a one-dimensional Box of floating-point numbers
     :param pairs: (index of the cosine, index of the sine) for each angle; None: those of Acrobot and Pendulum
     :raises ValueError: if the observation space is no such Box, if ``pairs`` is None and the environment another, or if
-        ``pairs`` are not pairs of different indices of variables between -1 and 1
+        ``pairs`` are not pairs of different indices of variables between -1 and 1; from ``reset`` and ``step``, if the squares
+        of a pair do not add up to 1
     """
 
     def __init__(self, env: gym.Env[Any, Any], pairs: Sequence[Sequence[int]] | None = None):
@@ -77,14 +80,22 @@ class AngleObservation(
         :param observation: of the wrapped environment, shape (n,)
         :return: of the wrapper, shape (n - n_pairs,), same type
         """
-        found = np.array(observation[self._kept])
-        found[self._angles] = np.arctan2(observation[self._sin], observation[self._cos])
+        whole = np.asarray(observation, dtype=self.env.observation_space.dtype)
+        found, cos, sin = whole[self._kept], whole[self._cos], whole[self._sin]
+        squares = cos * cos + sin * sin
+        if np.abs(squares - 1.0).max() > _NO_ANGLE:
+            pairs = list(zip(self._cos.tolist(), self._sin.tolist(), strict=True))
+            raise ValueError(
+                f"the squares of a cosine and a sine must add up to 1, got {squares.tolist()} for pairs={pairs}: wrap the "
+                "environment before its observations are rescaled or normalised, or pass other pairs"
+            )
+        found[self._angles] = np.arctan2(sin, cos)
         return found
 
 
 def _known_layout(env: gym.Env[Any, Any], n: int) -> tuple[tuple[tuple[int, int], ...] | None, tuple[str, ...]]:
     for kind, n_variables, pairs, names in _KNOWN:
-        if isinstance(env.unwrapped, kind) and n == n_variables:
+        if isinstance(env.unwrapped, kind) and n == n_variables and env.observation_space == env.unwrapped.observation_space:
             return pairs, names
     return None, ()
 

@@ -139,3 +139,21 @@ def test_fitted_rmax_needs_no_argument_for_a_wrapped_environment():
     assert model.agent.periodic == (True, True, False, False)
     assert model.agent.task.state_names == ("theta1", "theta2", "theta1_dot", "theta2_dot")
     assert model.agent.grid.arrays.shape.tolist() == [4, 4, 5, 5]
+
+
+def test_what_are_no_cosines_and_sines_any_more_is_refused():
+    rescaled = gym.wrappers.RescaleObservation(gym.make("Acrobot-v1"), np.float32(0.0), np.float32(1.0))
+    with pytest.raises(ValueError, match="for this environment they are not known"):
+        AngleObservation(rescaled)
+    with pytest.raises(
+        ValueError, match=r"must add up to 1, got \[1.2.* for pairs=\[\(0, 1\)\]: wrap the env.* before"
+    ):
+        AngleObservation(rescaled, pairs=[(0, 1)]).reset(seed=0)
+
+
+def test_observations_may_be_lists_and_whole_numbers():
+    env = Given((-1.0,) * 2, (1.0,) * 2, np.float32)
+    wrapped = AngleObservation(env, pairs=[(0, 1)])
+    for env.next in ([0, 1], np.array([0, 1])):
+        found, _ = wrapped.reset()
+        assert found.dtype == np.float32 and found == pytest.approx([np.pi / 2])

@@ -66,7 +66,9 @@ def check_prior(given: PriorPredictions, method: object, n: int, n_variables: in
     if not isinstance(given, PriorPredictions):
         raise ValueError(f"{name}.prior must return PriorPredictions, got {reprlib.repr(given)}")
     for field, array in zip(given._fields, given, strict=True):
-        if np.shape(array) != (n, n_variables):
+        if not isinstance(array, np.ndarray) or not np.issubdtype(array.dtype, np.floating):
+            raise ValueError(f"{name}.prior returned {field} that is no array of floats, got {reprlib.repr(array)}")
+        if array.shape != (n, n_variables):
             raise ValueError(f"{name}.prior returned {field} of shape {np.shape(array)}; it must be {(n, n_variables)}")
         wrong = ~np.isfinite(array) | ((array < 0.0) & (field == "weight"))
         if wrong.any():

@@ -7,10 +7,12 @@ the model, which says what pairs of the grid it changes, fits these anew, and sw
 
 from __future__ import annotations
 
+import math
 import reprlib
 import threading
 from collections.abc import Sequence
 from dataclasses import replace
+from numbers import Real
 from time import perf_counter
 from typing import Any
 
@@ -145,7 +147,10 @@ class FittedRMaxAgent:
         self._prior_version = -1
         # Pairs whose rows are to be updated: an interrupt in between loses none.
         self._outdated: list[np.ndarray] = []
-        self._widen(self._method.lowest_reward())
+        lowest: Any = self._method.lowest_reward()
+        if not isinstance(lowest, Real) or not math.isfinite(lowest):
+            raise ValueError(f"{type(self._method).__name__}.lowest_reward must return a finite number, got {lowest!r}")
+        self._widen(float(lowest))
 
     def prepare(self) -> None:
         """Model what is transferred before the first step, and plan until the values have converged."""

@@ -51,6 +51,7 @@ def checked_source(source: Any) -> Any:
         if find_file(Path(source)) is not None or task_spec(str(source)) is not None:
             return source
         remedy = "; write one with SourceInstances.record(...).save(path), or with the command sb3-combrel record"
+        remedy += did_you_mean(source, gym.registry)
         return read_named("source", source, remedy=remedy)
     if (found := read_experience(source)) is not None:
         return found

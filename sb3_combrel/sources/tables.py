@@ -55,14 +55,14 @@ def read_table(
     flags = periodic_flags(periodic, len(names))
     check_periods(np.array(flags) & (bounds is None))
     _warn_of_ends(frame, names)
-    steps, next_states = _with_next_states(frame, names)
+    steps, next_states, ended = _with_next_states(frame, names)
     states = _numbers(steps, names)
     actions = _actions(steps, action_names)
     if n_actions is None:
         n_actions = len(action_names) or int(actions.max(initial=0)) + 1
     unknown = np.full(len(names), np.inf)
     limits = (-unknown, unknown) if bounds is None else check_bounds(bounds, len(names))
-    columns = states, actions, _numbers(steps, [REWARD])[:, 0], next_states, _terminated(steps)
+    columns = states, actions, _numbers(steps, [REWARD])[:, 0], next_states, ended
     given = {"state_names": names, "action_names": tuple(action_names), "periodic": flags}
     origin = {"env": None, "recorder": os.path.basename(table) if isinstance(table, str | os.PathLike) else "table"}
     return Transitions.within(limits, columns, n_actions, given, origin)
@@ -135,13 +135,13 @@ def _require(frame: pd.DataFrame, name: str, others: Sequence[str] = ()) -> None
         raise ValueError(f"the table has no column {name!r}, its columns are {columns}{meant}")
 
 
-def _with_next_states(frame: pd.DataFrame, names: Sequence[str]) -> tuple[pd.DataFrame, Floats]:
-    """The rows that are transitions, and where each leads: by columns of its own, or by the next row of its episode."""
+def _with_next_states(frame: pd.DataFrame, names: Sequence[str]) -> tuple[pd.DataFrame, Floats, NDArray[np.bool_]]:
+    """The rows that are transitions, where each leads, by columns of its own or the next row, and whether it terminates."""
     following = [f"{NEXT}{name}" for name in names]
     if any(name in frame.columns for name in following):
         for name in following:
             _require(frame, name, following)
-        return frame, _numbers(frame, following)
+        return frame, _numbers(frame, following), _terminated(frame)
     ends = _flags(frame, TERMINATED) | _flags(frame, DONE) | _flags(frame, TRUNCATED)
     acts = frame[ACTION].notna().to_numpy()
     # The row after an end is its last state only if nothing was done there.
@@ -153,7 +153,8 @@ def _with_next_states(frame: pd.DataFrame, names: Sequence[str]) -> tuple[pd.Dat
         follows &= episode.to_numpy()[1:] == episode.to_numpy()[:-1]
     goes_on = np.append(follows, False)
     # The last step before a time limit may be left out; where an end was reached must be known.
-    lost = np.flatnonzero(_terminated(frame) & acts & ~goes_on)
+    terminated = _terminated(frame)
+    lost = np.flatnonzero(terminated & acts & ~goes_on)
     if len(lost):
         raise ValueError(
             f"the table does not say in which state the episode that terminates in row {frame.index[lost[0]]} arrived: add "
@@ -162,7 +163,9 @@ def _with_next_states(frame: pd.DataFrame, names: Sequence[str]) -> tuple[pd.Dat
     chosen = np.flatnonzero(acts & goes_on)
     if len(chosen) == 0:
         raise ValueError(f"the table has no transition: it needs columns {following}, or two rows of one episode")
-    return frame.iloc[chosen], _numbers(frame.iloc[chosen + 1], names)
+    # A last state may say itself that it is one.
+    terminated |= np.append(terminated[1:] & ~acts[1:], False)
+    return frame.iloc[chosen], _numbers(frame.iloc[chosen + 1], names), terminated[chosen]
 
 
 def _warn_of_ends(frame: pd.DataFrame, names: Sequence[str]) -> None:
@@ -213,9 +216,9 @@ def _numbers(frame: pd.DataFrame, names: Sequence[str]) -> Floats:
         wrong = np.flatnonzero(~np.isfinite(column))
         if len(wrong):
             row = wrong[0]
-            raise ValueError(
-                f"column {name!r} must be finite numbers, got {frame[name].tolist()[row]!r} in row {frame.index[row]}"
-            )
+            no_state = "" if name in _NO_STATES else "; if it is no state variable, name those that are: state_names=[...]"
+            got = f"{frame[name].tolist()[row]!r} in row {frame.index[row]}"
+            raise ValueError(f"column {name!r} must be finite numbers, got {got}{no_state}")
     return frame[list(names)].to_numpy(dtype=np.float64)
 
 

@@ -80,6 +80,9 @@ class Transfer(ABC):
             raise ValueError(
                 f'{type(self).__name__} has use="instances", but no method transferred(states, actions, own_weight)'
             )
+        keeps, takes = (getattr(type(self), name) is not getattr(Transfer, name) for name in ("get_state", "set_state"))
+        if keeps != takes:
+            raise ValueError(f"{type(self).__name__} must have both get_state() and set_state(state), or neither")
         self.task = task
         self.rng = rng
 

@@ -59,7 +59,9 @@ def main(args: Sequence[str] | None = None) -> int:
     except Exception as error:
         if _is_verbose(rest) or not (isinstance(error, USERS_ERRORS) or _comes_from("yaml", error) or _is_of_network(error)):
             raise
-        print(f"sb3_combrel.zoo: {_message_of(error)}", file=sys.stderr)
+        entry = "; add an entry for the task, with policy and transfer, to a file of your own, and pass --conf-file"
+        advice = entry if "Hyperparameters not found" in str(error) else ""
+        print(f"sb3_combrel.zoo: {_message_of(error)}{advice}", file=sys.stderr)
         return 1
 
 

@@ -203,9 +203,7 @@ def test_a_state_that_cannot_be_one_is_refused_and_one_in_raw_units_warned_of(li
     for wrong in ([0.1, 0.2], [[0.5]], [np.nan]):
         with pytest.raises(ValueError, match="state must be 1 finite numbers, got"):
             agent.q_values(wrong)
-    with pytest.warns(
-        UserWarning, match=r"outside what has been seen, .*model.policy.to_unit\(observation\)"
-    ):
+    with pytest.warns(UserWarning, match=r"outside what has been seen, .*model.policy.to_unit\(observation\)"):
         agent.q_values([-0.5])
     with warnings.catch_warnings():
         warnings.simplefilter("error")

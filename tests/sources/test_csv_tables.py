@@ -255,3 +255,12 @@ def test_bounds_of_a_table_are_checked(bounds):
 def test_flags_may_be_missing_in_columns_that_allow_it():
     table = log(terminated=pd.array([False] * 6 + [pd.NA], dtype="boolean"))
     assert len(SourceInstances.from_table(table)) == 6
+
+
+@pytest.mark.parametrize("name", ["terminated", "done"])
+def test_the_row_of_a_last_state_may_say_that_it_is_an_end(name, recwarn):
+    """As a loop writes it that notes each observation, and what was done there, if anything was."""
+    table = pd.DataFrame({"x": [0.0, 0.1, 0.2] * 2, "action": [1, 0, None] * 2, "reward": 0.0, name: [0, 0, 1, 0, 0, 0]})
+    source = SourceInstances.from_table(table.assign(truncated=[0, 0, 0, 0, 0, 1]))
+    assert source.terminated.tolist() == [False, True, False, False] and len(source) == 4
+    np.testing.assert_allclose(source.next_states[:, 0], [0.1, 0.2] * 2)

@@ -1,5 +1,7 @@
 """What users write: methods and mappings by name, and whether instances or a prior are transferred where nothing says so."""
 
+import re
+
 import numpy as np
 import pytest
 from helpers import factored as f
@@ -241,6 +243,7 @@ def predicted(effect=(0.1, 0.0), weight=(1.0, 0.0), n=2):
     [
         (None, "Mine.prior must return PriorPredictions, got None"),
         (predicted(effect=(0.0, 0.0, 0.0)), r"effect of shape \(2, 3\); it must be \(2, 2\)"),
+        (PriorPredictions([[0.1, 0.0]] * 2, [[1.0, 0.0]] * 2), "effect that is no array of floats, got"),
         (predicted(n=1), r"effect of shape \(1, 2\); it must be \(2, 2\)"),
         (predicted(effect=(np.nan, 0.0)), r"effect \[nan  0.\] for row 0; it must be finite"),
         (predicted(weight=(np.inf, 1.0)), r"weight \[inf  1.\] for row 0; it must be finite, and at least 0"),
@@ -392,3 +395,20 @@ def test_a_method_of_instances_must_have_some():
         use = "actions"
 
     assert small(transfer=Acting()).learn(20).agent.model.n_instances == 20
+
+
+def test_what_is_kept_must_be_taken_back():
+    class Keeps(Mine):
+        def get_state(self):
+            return {"n": np.zeros(1)}
+
+    with pytest.raises(ValueError, match=r"Keeps must have both get_state\(\) and set_state\(state\), or neither"):
+        small(transfer=Keeps())
+
+
+@pytest.mark.parametrize("lowest", [None, np.nan, "-1"])
+def test_a_lowest_reward_must_be_a_finite_number(lowest):
+    method = Mine()
+    method.lowest_reward = lambda: lowest
+    with pytest.raises(ValueError, match=re.escape(f"Mine.lowest_reward must return a finite number, got {lowest!r}")):
+        small(transfer=method)

@@ -41,12 +41,14 @@ def summary_table(results: Mapping[str, Sequence[Result]]) -> Table:
         hardest = DOMAINS[name].thresholds[-1]
         for method, runs in by_method(of_domain).items():
             samples = np.array([result.steps for result in runs])
+            n_episodes, too_few = samples.shape[1], samples.shape[1] < WINDOW
             needed = steps_to_reach(samples, hardest, WINDOW)
             parts = samples.sum(axis=1), samples[:, :12].sum(axis=1), samples[:, -20:].mean(axis=1)
             reached = f"{np.isfinite(needed).sum()} of {len(samples)} runs; {hardest}"
-            last = f"{_median_text(needed)} ({reached})"
+            last = f"- (fewer than {WINDOW} episodes)" if too_few else f"{_median_text(needed)} ({reached})"
             rows.append((DOMAINS[name].title, method, str(len(samples)), *map(mean_and_error, parts), last))
-    of_steps = ("steps, all", "first 12 episodes", "an episode, last 20", "steps to the last threshold")
+    first, end = min(12, n_episodes), min(20, n_episodes)
+    of_steps = ("steps, all", f"first {first} episodes", f"an episode, last {end}", "steps to the last threshold")
     title = "Environment steps, mean and standard error; median until the last threshold"
     return Table(title, ("domain", "method", "runs", *of_steps), rows)
 
@@ -106,8 +108,10 @@ def uses_table(results: Mapping[str, Sequence[Result]]) -> Table:
     """Make a table of how often transferred instances were used at the agent's states: what they change is at most that."""
     rows = []
     for name, of_domain in results.items():
-        for method, runs in by_method([result for result in of_domain if result.more["uses"]]).items():
+        for method, runs in by_method(of_domain).items():
             uses = [result.more["uses"] for result in runs]
+            if not any(uses):
+                continue
             n_uses = np.array([sum(row[-1] for row in each) for each in uses])
             n_mappings = np.array([len({tuple(row[1:4]) for row in each}) for each in uses])
             per_step = np.mean(n_uses / [sum(result.steps) for result in runs])
@@ -115,7 +119,7 @@ def uses_table(results: Mapping[str, Sequence[Result]]) -> Table:
             cells = f"{n_uses.mean():,.0f}", f"{per_step:.3f}", f"{n_mappings.mean():,.0f}", f"{per_episode:.1f}"
             rows.append((DOMAINS[name].title, method, *cells))
     header = ("domain", "method", "uses", "uses a step", "mappings used", "in an episode")
-    title = "State-action pairs at the agent's states for which transferred instances were used, mean of the runs"
+    title = "State-action pairs at the agent's states for which transferred instances were used by any run, mean of all runs"
     return Table(title, header, rows)
 
 

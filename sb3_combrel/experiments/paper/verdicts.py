@@ -8,13 +8,20 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_combrel.comparison.measures import steps_to_reach
-from sb3_combrel.comparison.statistics import ALPHA, bootstrap_relative_difference, cliffs_delta, holm, p_value_of_difference
+from sb3_combrel.comparison.statistics import (
+    ALPHA,
+    bootstrap_relative_difference,
+    cliffs_delta,
+    holm,
+    p_value_of_difference,
+    smallest_p_value,
+)
 from sb3_combrel.comparison.tables import Table, interval_text, p_text, share_text, without_minus_zero
 from sb3_combrel.experiments.paper import methods as m
 from sb3_combrel.experiments.paper.domains import DOMAINS, ICUB, MOUNTAIN_CAR
 from sb3_combrel.experiments.paper.figures import WINDOW
 
-HELD, NOT_HELD, OPPOSITE = "held", "not held", "opposite"
+HELD, NOT_HELD, OPPOSITE, TOO_FEW = "held", "not held", "opposite", "too few runs"
 PAPERS, WINDOWS, CONTROL = "paper", "window", "control"
 
 
@@ -82,12 +89,13 @@ class Verdict(NamedTuple):
     p_value: float  # of the permutation test that both take the same steps in the mean
     corrected: float  # the same by Holm's method, for the number of rows of the table
     p_threshold: float  # of Mann and Whitney's test of the steps until the domain's last threshold, by Holm's method as well
+    tellable: bool  # whether there are runs enough for any p-value below ``ALPHA``
 
     @property
     def verdict(self) -> str:
         """Whether the claim held."""
         if not self.corrected < ALPHA:
-            return NOT_HELD
+            return NOT_HELD if self.tellable else TOO_FEW
         return HELD if self.saved > 0.0 else OPPOSITE
 
 
@@ -116,7 +124,8 @@ def judge(steps: Mapping[str, Mapping[str, np.ndarray]], kind: str) -> list[Verd
     for claim, samples in totals.items():
         more, low, high = bootstrap_relative_difference(*samples)
         p = p_values[claim], corrected[claim], p_thresholds[claim]
-        found.append(Verdict(claim, -more, -high, -low, -cliffs_delta(*samples), *p))
+        tellable = smallest_p_value(len(samples[0]), len(samples[1]), 1) < ALPHA
+        found.append(Verdict(claim, -more, -high, -low, -cliffs_delta(*samples), *p, tellable))
     return found
 
 

@@ -20,6 +20,7 @@ from sb3_combrel.experiments.paper.verdicts import (
     NOT_HELD,
     OPPOSITE,
     PAPERS,
+    TOO_FEW,
     WINDOWS,
     judge,
     verdict_table,
@@ -48,7 +49,7 @@ class TestVerdicts:
         found = verdict_of(np.array([[10, 20], [30, 40]]), np.array([[100, 100], [60, 140]]))
         assert (found.saved, found.delta) == (1 - 50 / 200, 1.0)
         # Of the six regroupings two have a difference as large.
-        assert found.p_value == pytest.approx(2 / 6) and found.verdict == NOT_HELD
+        assert found.p_value == pytest.approx(2 / 6) and found.verdict == TOO_FEW
 
     @pytest.mark.parametrize(("combrel", "none", "saved", "verdict"), [(200, 400, 0.5, HELD), (400, 200, -1.0, OPPOSITE)])
     def test_half_and_twice_the_steps(self, combrel, none, saved, verdict):
@@ -98,7 +99,7 @@ class TestVerdicts:
 
     def test_a_single_run_has_no_interval(self):
         (row,) = verdict_table([verdict_of(runs(100, n_runs=1), runs(200, n_runs=1))], "title").rows
-        assert row[3] == row[5] == row[6] == row[7] == "-" and row[-1] == NOT_HELD
+        assert row[3] == row[5] == row[6] == row[7] == "-" and row[-1] == TOO_FEW
 
     def test_the_threshold_is_the_domains_last(self):
         # All reach 250 steps at once with COMBREL, none without transfer, in as many steps.
@@ -132,17 +133,20 @@ class TestSummary:
 
     def test_short_and_single_runs(self):
         (row,) = tables.summary_table({ROBOT: [made_up(ROBOT, m.COMBREL_PLAIN, 0, [30, 50])]}).rows
-        assert row[2:] == ("1", "80", "80", "40", "never (0 of 1 runs; 40)")
+        assert row[2:] == ("1", "80", "80", "40", "- (fewer than 5 episodes)")
+        header = tables.summary_table({ROBOT: [made_up(ROBOT, m.COMBREL_PLAIN, 0, [30, 50])]}).header
+        assert header[4:6] == ("first 2 episodes", "an episode, last 2")
 
 
 def test_uses_a_step_and_mappings():
-    some = [["East", "Left", "x<-x", "", 6], ["West", "Left", "x<-x", "", 3]], [["East", "Left", "x<-v", "", 1]]
+    some = [["East", "Left", "x<-x", "", 6], ["West", "Left", "x<-x", "", 3]], [["East", "Left", "x<-v", "", 1]], []
     results = [
         made_up(CAR, m.UNRELATED, seed, [5, 15], uses=uses, mappings_of_episodes=counts)
-        for seed, (uses, counts) in enumerate(zip(some, ([1, 1], [1, 0]), strict=True))
+        for seed, (uses, counts) in enumerate(zip(some, ([1, 1], [1, 0], [0, 0]), strict=True))
     ]
     (row,) = tables.uses_table({CAR: [*results, made_up(CAR, m.NO_TRANSFER, 0, [20])]}).rows
-    assert row == ("Mountain Car 4D", m.UNRELATED, "5", f"{(9 / 20 + 1 / 20) / 2:.3f}", "1", "0.8")
+    # A run that used nothing counts as well.
+    assert row == ("Mountain Car 4D", m.UNRELATED, "3", f"{(9 / 20 + 1 / 20) / 3:.3f}", "1", "0.5")
 
 
 def test_training_until_each_threshold():
