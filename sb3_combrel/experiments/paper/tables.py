@@ -41,12 +41,12 @@ def summary_table(results: Mapping[str, Sequence[Result]]) -> Table:
         hardest = DOMAINS[name].thresholds[-1]
         for method, runs in by_method(of_domain).items():
             samples = np.array([result.steps for result in runs])
-            n_episodes, too_few = samples.shape[1], samples.shape[1] < WINDOW
             needed = steps_to_reach(samples, hardest, WINDOW)
             parts = samples.sum(axis=1), samples[:, :12].sum(axis=1), samples[:, -20:].mean(axis=1)
             reached = f"{np.isfinite(needed).sum()} of {len(samples)} runs; {hardest}"
-            last = f"- (fewer than {WINDOW} episodes)" if too_few else f"{_median_text(needed)} ({reached})"
+            last = f"- (fewer than {WINDOW} episodes)" if samples.shape[1] < WINDOW else f"{_median_text(needed)} ({reached})"
             rows.append((DOMAINS[name].title, method, str(len(samples)), *map(mean_and_error, parts), last))
+    n_episodes = max((len(result.steps) for of_domain in results.values() for result in of_domain), default=20)
     first, end = min(12, n_episodes), min(20, n_episodes)
     of_steps = ("steps, all", f"first {first} episodes", f"an episode, last {end}", "steps to the last threshold")
     title = "Environment steps, mean and standard error; median until the last threshold"
