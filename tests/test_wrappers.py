@@ -145,9 +145,7 @@ def test_what_are_no_cosines_and_sines_any_more_is_refused():
     rescaled = gym.wrappers.RescaleObservation(gym.make("Acrobot-v1"), np.float32(0.0), np.float32(1.0))
     with pytest.raises(ValueError, match="for this environment they are not known"):
         AngleObservation(rescaled)
-    with pytest.raises(
-        ValueError, match=r"must add up to 1, got \[1.2.* for pairs=\[\(0, 1\)\]: wrap the env.* before"
-    ):
+    with pytest.raises(ValueError, match=r"must add up to 1, got \[1.2.* for pairs=\[\(0, 1\)\]: wrap the env.* before"):
         AngleObservation(rescaled, pairs=[(0, 1)]).reset(seed=0)
 
 
