@@ -434,6 +434,7 @@ class FittedRMaxAgent:
 
         :param observed: whether the transfer method knows them
         """
+        before = list(self._outdated)
         for state, action, reward, next_state, terminated in transitions:
             if observed:
                 self.model.add(state, action, reward, next_state, terminated)
@@ -441,7 +442,8 @@ class FittedRMaxAgent:
             self._take_in(state, action, reward, next_state, terminated)
             if terminated:
                 self._method.end_episode(truncated=False)
-        self._outdated.append(self.model.outdated())
+        # Of what these change each pair once.
+        self._outdated = [*before, self.model.outdated()]
 
     @property
     def _lines_move(self) -> bool:
