@@ -7,18 +7,16 @@ the model, which says what pairs of the grid it changes, fits these anew, and sw
 
 from __future__ import annotations
 
-import math
 import reprlib
 import threading
 from collections.abc import Sequence
 from dataclasses import replace
-from numbers import Real
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from sb3_combrel.common.checks import check_resolution
+from sb3_combrel.common.checks import check_finite, check_resolution
 from sb3_combrel.common.constants import (
     BEYOND,
     COARSE,
@@ -147,10 +145,9 @@ class FittedRMaxAgent:
         self._prior_version = -1
         # Pairs whose rows are to be updated: an interrupt in between loses none.
         self._outdated: list[np.ndarray] = []
-        lowest: Any = self._method.lowest_reward()
-        if not isinstance(lowest, Real) or not math.isfinite(lowest):
-            raise ValueError(f"{type(self._method).__name__}.lowest_reward must return a finite number, got {lowest!r}")
-        self._widen(float(lowest))
+        lowest = self._method.lowest_reward()
+        check_finite(f"what {type(self._method).__name__}.lowest_reward returns", lowest)
+        self._widen(lowest)
 
     def prepare(self) -> None:
         """Model what is transferred before the first step, and plan until the values have converged."""

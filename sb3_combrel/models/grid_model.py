@@ -162,13 +162,11 @@ class GridModel(Model):
         if not terminated or self.settings.ends_by_action:
             return due
         self._renew_ends()
-        return np.union1d(due, self._note_end(action, slot))
-
-    def _note_end(self, action: int, slot: int) -> np.ndarray:
-        """Note that an instance has ended an episode, or that it counts no more: pairs of all actions that may lead there."""
-        arrived, numbers = self.arrivals.state[action, slot].copy(), self._measured[2]
+        # What is known of ends concerns all actions that may lead there.
+        arrived, noted = self.arrivals.state[action, slot], [due]
         widest = (self.grid.diagonal + float(np.linalg.norm(self.instances.effect[action, slot]))) ** 2
-        return np.concatenate([self._note((arrived, numbers, numbers), a, widest, ENDED) for a in range(self.n_actions)])
+        noted += [self._note((arrived, *numbers_and_size), other, widest, ENDED) for other in range(self.n_actions)]
+        return np.unique(np.concatenate(noted))
 
     def _inform(self, reward: float, terminated: bool, due: np.ndarray) -> np.ndarray:
         """Note an outcome; with the first that differs grid points need less weight: the pairs that are due."""
@@ -202,7 +200,8 @@ class GridModel(Model):
             if instances.terminated[action, slot]:
                 instances.terminated[action, slot] = False
                 self._renew_ends()
-                removed = np.union1d(removed, self._note_end(action, slot))
+                # Rows that have an end in them, of whatever action.
+                removed = np.union1d(removed, np.flatnonzero(np.isinf(self.pairs.surprise)))
             return slot, removed
         if size == instances.capacity:
             self._make_room(size + 1)

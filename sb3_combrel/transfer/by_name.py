@@ -6,7 +6,6 @@ import copy
 import importlib
 import inspect
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 from sb3_combrel.common.serialisation import KIND, from_plain, to_plain
@@ -74,8 +73,7 @@ def _method(name: str) -> Any:
     except (ImportError, AttributeError, ValueError) as error:
         close = did_you_mean(attribute, [each.rpartition(".")[2] for each in own])
         known = ", ".join(sorted(own))
-        is_file = Path(name).suffix in SUFFIXES or Path(name).is_file()
-        hint = f"; a file is the source of a method, transfer=COMBREL({name!r})" if is_file else close
+        hint = f"; a file is the source of a method, transfer=COMBREL({name!r})" if name.endswith(SUFFIXES) else close
         raise ValueError(f"transfer names {name!r}, which is no transfer method; known are {known}{hint}") from error
 
 

@@ -296,12 +296,15 @@ def test_how_low_values_may_get_does_not_depend_on_how_often_all_is_computed_ane
     assert agent.planner.bounds == bounds and bounds[0] < -50.0
 
 
-def test_pairs_of_all_actions_hear_of_an_end_that_counts_no_more():
+@pytest.mark.parametrize("longer", [0.0, 0.2])
+def test_pairs_of_all_actions_hear_of_an_end_that_counts_no_more(longer):
+    """Action 1 moves farther by ``longer`` than action 0, which ends the episode at 0.9; known first."""
     agent = make_agent(1, 2, max_instances=20)
-    for action in (1, 0):
-        for x in np.linspace(0.6, 0.85, 20):
+    for action in (0, 1):
+        for x in np.linspace(0.6, 0.85, 20) - longer * action:
             ends = action == 0 and x > 0.84
-            agent.update(np.array([x]), action, -100.0 if ends else -1.0, np.array([x + 0.05]), bool(ends))
+            to = np.array([x + 0.05 + longer * action])
+            agent.update(np.array([x]), action, -100.0 if ends else -1.0, to, bool(ends))
     rewards = agent.mdp.arrays.reward.T.ravel()
     near = np.flatnonzero(agent.model.known & np.isfinite(rewards) & (rewards < -10.0))
     assert len(near[near >= agent.grid.n_points]) > 0

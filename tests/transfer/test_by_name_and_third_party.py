@@ -410,5 +410,7 @@ def test_what_is_kept_must_be_taken_back():
 def test_a_lowest_reward_must_be_a_finite_number(lowest):
     method = Mine()
     method.lowest_reward = lambda: lowest
-    with pytest.raises(ValueError, match=re.escape(f"Mine.lowest_reward must return a finite number, got {lowest!r}")):
+    with pytest.raises(
+        ValueError, match=re.escape(f"what Mine.lowest_reward returns must be a finite number, got {lowest!r}")
+    ):
         small(transfer=method)
