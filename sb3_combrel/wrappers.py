@@ -11,6 +11,7 @@ from gymnasium import spaces
 from gymnasium.envs.classic_control import AcrobotEnv, PendulumEnv
 from numpy.typing import NDArray
 
+from sb3_combrel.common.attributes import list_of
 from sb3_combrel.common.checks import check_count
 
 # What a cosine or a sine may exceed 1 by: bounds are often float32.
@@ -62,12 +63,12 @@ class AngleObservation(
         low, high = box.low[self._kept], box.high[self._kept]
         low[self._angles], high[self._angles] = -np.pi, np.pi
         self.observation_space = spaces.Box(low, high, dtype=box.dtype.type)
-        inner = _list_of(env, "periodic", bool | np.bool_, box.shape[0]) or [False] * box.shape[0]
+        inner = list_of(env, "periodic", bool, np.bool_) or [False] * box.shape[0]
         #: Which variables are periodic: the angles, and what the wrapped environment says of the others.
         self.periodic = tuple(bool(angle or inner[k]) for angle, k in zip(self._angles, self._kept, strict=True))
         is_known = known is not None and np.array_equal(np.sort(known, axis=0), np.stack([self._cos, self._sin], axis=1))
         #: The names of the variables.
-        self.state_names = names if is_known else self._names(_list_of(env, "state_names", str, box.shape[0]))
+        self.state_names = names if is_known else self._names(list_of(env, "state_names", str))
 
     def _names(self, given: Sequence[str] | None) -> tuple[str, ...]:
         """Name the variables: as the wrapped environment does, or s with the index; an angle by its cosine."""
@@ -98,16 +99,6 @@ def _known_layout(env: gym.Env[Any, Any], n: int) -> tuple[tuple[tuple[int, int]
         if isinstance(env.unwrapped, kind) and n == n_variables and env.observation_space == env.unwrapped.observation_space:
             return pairs, names
     return None, ()
-
-
-def _list_of(env: gym.Env[Any, Any], name: str, kind: Any, n: int) -> Sequence[Any] | None:
-    """Return an attribute of an environment if it is ``n`` values of a type."""
-    try:
-        value = env.get_wrapper_attr(name)
-    except AttributeError:
-        return None
-    is_list = isinstance(value, Sequence | np.ndarray) and len(value) == n and all(isinstance(each, kind) for each in value)
-    return value if is_list else None
 
 
 def _checked_pairs(pairs: Any, box: spaces.Box) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

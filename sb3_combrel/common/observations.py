@@ -18,9 +18,14 @@ ROUNDING = 1e-6
 
 
 def with_own_arrays(env: Any) -> Any:
-    """An environment in :class:`OwnArrays`; a vectorised one stays as it is, and one whose observations are no arrays."""
-    is_one = isinstance(env, gym.Env) and isinstance(env.observation_space, spaces.Box)
-    return OwnArrays(env) if is_one else env
+    """An environment in :class:`OwnArrays`, or with those that it holds in them, if their observations are arrays."""
+    if isinstance(env, gym.Env):
+        needs_it = isinstance(env.observation_space, spaces.Box) and not isinstance(env, OwnArrays)
+        return OwnArrays(env) if needs_it else env
+    # A vectorised one; those of a ``SubprocVecEnv`` are out of reach.
+    envs = getattr(getattr(env, "unwrapped", None), "envs", [])
+    envs[:] = map(with_own_arrays, envs)
+    return env
 
 
 class OwnArrays(gym.Wrapper[Any, Any, Any, Any]):

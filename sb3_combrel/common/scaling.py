@@ -65,8 +65,8 @@ class StateScaling:
         """Take limits of :meth:`limits_of`, and for variables without any the range of some states, shape (n, n_variables)."""
         low, high = limits
         least, most = states.min(axis=0), states.max(axis=0)
-        # A variable that never changes has no scale.
-        around = np.where(most > least, 0.0, 0.5)
+        # A variable that never changes has no scale; of a huge one a half is lost in rounding.
+        around = np.where(most > least, 0.0, np.maximum(0.5, np.spacing(np.abs(most))))
         found_low, found_high = around_zero(least - around, most + around)
         unbounded = without_bounds(low, high)
         return cls(np.where(unbounded, found_low, low), np.where(unbounded, found_high, high))

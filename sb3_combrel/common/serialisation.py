@@ -85,6 +85,7 @@ def _read_object(kind: Any, content: Content) -> Any:
 
 def damage_text(error: BaseException) -> str:
     """What was wrong with damaged content, given what reading it raised, in one line of at most 300 characters."""
-    if isinstance(error, KeyError) and error.args:
+    # A sentence is of something else than a dict, an archive for example.
+    if isinstance(error, KeyError) and error.args and " " not in str(error.args[0]):
         return f"{error.args[0]!r} is missing"
     return " ".join(str(error).split())[:300] or type(error).__name__

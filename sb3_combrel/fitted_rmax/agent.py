@@ -431,16 +431,20 @@ class FittedRMaxAgent:
 
         :param observed: whether the transfer method knows them
         """
-        before = list(self._outdated)
-        for state, action, reward, next_state, terminated in transitions:
-            if observed:
-                self.model.add(state, action, reward, next_state, terminated)
-                continue
-            self._take_in(state, action, reward, next_state, terminated)
-            if terminated:
-                self._method.end_episode(truncated=False)
         # Of what these change each pair once.
-        self._outdated = [*before, self.model.outdated()]
+        outdated = np.zeros(len(self.model.known), dtype=np.bool_)
+        try:
+            for transition in transitions:
+                if observed:
+                    self._outdated.append(self.model.add(*transition))
+                else:
+                    self._take_in(*transition)
+                    if transition[-1]:
+                        self._method.end_episode(truncated=False)
+                outdated[self._outdated.pop()] = True
+        finally:
+            outdated[self.model.outdated()] = True
+            self._outdated.append(np.flatnonzero(outdated))
 
     @property
     def _lines_move(self) -> bool:
@@ -494,7 +498,8 @@ class FittedRMaxAgent:
                 raise
 
     def _rescale(self, scaling: StateScaling, bounds: StateScaling, lines: np.ndarray) -> None:
-        before, transitions, lowest = self.task.scaling, self.model.transitions(), self.planner.bounds[0]
+        before, model, lowest = self.task.scaling, self.model, self.planner.bounds[0]
+        transitions = model.transitions()
         # What a transfer method has learned is about the bounds.
         learned = self._method.get_state() if bounds == self.task.shared_scaling else {}
         self.task, self.grid = replace(self.task, scaling=scaling, bounds=bounds), self.grid.with_lines(lines)
@@ -511,6 +516,7 @@ class FittedRMaxAgent:
         if scaling != before:
             transitions = [(moved(s), a, r, moved(n), t) for s, a, r, n, t in transitions]
         self._take_in_all(transitions, observed=bool(learned))
+        self._outdated.append(self.model.take_over(model))
         self._plan(SWEEPS_AT_EPISODE_END)
 
     def plan_anew(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -10,13 +9,13 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from sb3_combrel.common.attributes import list_of
 from sb3_combrel.common.user_warnings import warn_user
 
 
 def names_of(env: VecEnv) -> dict[str, Any]:
     """Return names of state variables and actions, where the environment has as many of them as it must have."""
-    found = {name: _list_of(env, name, str) for name in ("state_names", "action_names")}
-    return {name: names for name, names in found.items() if names}
+    return {name: names for name in ("state_names", "action_names") if (names := list_of(env, name, str))}
 
 
 def joined_names(saved: dict[str, Any], of_env: dict[str, Any]) -> dict[str, Any]:
@@ -29,8 +28,7 @@ def joined_names(saved: dict[str, Any], of_env: dict[str, Any]) -> dict[str, Any
 
 def periodic_of(env: VecEnv) -> list[bool] | None:
     """Return which state variables are periodic, where the environment says so in its attribute ``periodic``."""
-    flags = _list_of(env, "periodic", bool, np.bool_)
-    return None if flags is None else [bool(flag) for flag in flags]
+    return [bool(flag) for flag in list_of(env, "periodic", bool, np.bool_) or ()] or None
 
 
 def warn_of_shared(env: VecEnv, callback: BaseCallback) -> None:
@@ -48,25 +46,6 @@ def warn_of_shared(env: VecEnv, callback: BaseCallback) -> None:
             f"{type(callback).__name__} evaluates in the environment that the model learns in: after each evaluation it "
             "takes a state of that for the one that its own action has led to; give it an environment of its own"
         )
-
-
-def _list_of(env: VecEnv, name: str, *types: type) -> list[Any] | None:
-    """An attribute of the first environment, if it is a value for each variable, or action; a warning if it is not."""
-    what = "action" if name == "action_names" else "variable"
-    n = int(getattr(env.action_space, "n", 0) if what == "action" else (env.observation_space.shape or (0,))[0])
-    # Asking a SubprocVecEnv for an attribute that is not there would end its worker.
-    if n == 0 or not env.has_attr(name):
-        return None
-    value = env.get_attr(name, 0)[0]
-    is_list = isinstance(value, Sequence | np.ndarray) and not isinstance(value, str)
-    if is_list and len(value) == n and all(isinstance(each, types) for each in value):
-        return list(value)
-    if not (types == (str,) and (value is None or (is_list and len(value) == 0))):
-        warn_user(
-            f"the environment's {name}={value!r} is not one {types[0].__name__} for each of the {n} {what}s, and is ignored: "
-            f"{'pass FittedRMax(env, periodic=[...])' if name == 'periodic' else 'an environment may leave it out'}"
-        )
-    return None
 
 
 def has_time_limit(env: VecEnv) -> bool:
@@ -94,6 +73,12 @@ def true_outcomes(new_obs: Any, infos: list[dict[str, Any]], ended: list[int]) -
     """
     next_obs, terminated = np.array(new_obs), [False] * len(infos)
     for e in ended:
-        next_obs[e] = infos[e]["terminal_observation"]
+        last = infos[e]["terminal_observation"]
+        if np.array_equal(last, next_obs[e]):
+            warn_user(
+                "the last observation of an episode equals the first of the next: if that is not so in your task, the "
+                "environment returns one array each time and changes it; let it return observation.copy()"
+            )
+        next_obs[e] = last
         terminated[e] = not infos[e].get("TimeLimit.truncated", False)
     return next_obs, terminated

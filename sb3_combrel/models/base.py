@@ -140,6 +140,13 @@ class Model(ABC):
         """All pairs whose rows are not what the instances say: for new scales."""
         return np.arange(len(self.known))
 
+    def take_over(self, other: Model) -> np.ndarray:
+        """Take over what another model, whose transitions this one has, knows of those that ``max_instances`` has removed.
+
+        :return: the pairs whose rows are to be updated, int64
+        """
+        return NO_PAIRS
+
     def transitions(self) -> list[Transition]:
         """State, action, reward, next state and terminated of all instances, in the order in which they came."""
         rows, d = self.instances.rows()[np.argsort(self._numbers(), kind="stable")], self.grid.n_variables

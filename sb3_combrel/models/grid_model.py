@@ -174,7 +174,18 @@ class GridModel(Model):
         if not (terminated or abs(reward - self._first_reward) > 1e-9 * abs(reward)):
             return due
         self._informed_at = self.n_added
-        return np.union1d(due, np.flatnonzero(~self.known & (self.own_weight >= self._threshold)))
+        return np.union1d(due, self._with_enough())
+
+    def _with_enough(self) -> np.ndarray:
+        """The pairs that are not known, although their instances suffice."""
+        return np.flatnonzero(~self.known & (self.own_weight >= self._threshold))
+
+    def take_over(self, other: Model) -> np.ndarray:
+        assert isinstance(other, GridModel)
+        if self._informed or not other._informed:
+            return NO_PAIRS
+        self._informed_at = self.n_added
+        return self._with_enough()
 
     def _note(self, instance: tuple[np.ndarray, ...], action: int, widest: float, why: int) -> np.ndarray:
         """Note at the pairs of an action what has happened near them; those that are to be fitted."""

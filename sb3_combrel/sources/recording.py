@@ -37,7 +37,7 @@ def record(
 ) -> Transitions:
     """Let a behaviour act in a task; for the parameters see :meth:`SourceInstances.record`."""
     n_instances = as_transition_count("n_instances", n_instances)
-    task = env if isinstance(env, VecEnv) else with_own_arrays(make_env(env))
+    task = with_own_arrays(env if isinstance(env, VecEnv) else make_env(env))
     venv = task if isinstance(task, VecEnv) else DummyVecEnv([lambda: task])
     try:
         limits = limits_of_task(venv, bounds)

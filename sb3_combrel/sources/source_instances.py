@@ -126,7 +126,8 @@ class SourceInstances:
             the model sees normalised states and the original ones are recorded, but of an episode's last one what
             ``clip_obs`` has cut off stays cut off.
         :param n_instances: number of transitions to record
-        :param seed: seed of the environment, the random actions and the model's own randomness; None for none
+        :param seed: seed of the environment, the random actions, and what Stable-Baselines3's models draw; None for none.
+            ``FittedRMax`` and ``QLearning`` draw from generators of their own
         :param deterministic: whether an SB3 model takes its deterministic actions
         :param bounds: ``(low, high)`` of the states; None: those of the observation space, or the range of what is recorded
         :raises ValueError: if the spaces are not a Box of shape (n_variables,) and a Discrete, if ``n_instances``

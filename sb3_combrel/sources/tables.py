@@ -76,7 +76,10 @@ def _read(table: Table) -> pd.DataFrame:
     if os.path.isdir(table):
         raise ValueError(f"table must be a CSV file or a pandas DataFrame, got the folder {os.fspath(table)}")
     try:
-        frame = pd.read_csv(table, skipinitialspace=True)
+        # "None" and "NA" may be names of actions.
+        frame = pd.read_csv(
+            table, skipinitialspace=True, keep_default_na=False, na_values=["", "nan", "NaN"], float_precision="round_trip"
+        )
     except FileNotFoundError as error:
         raise FileNotFoundError(f"there is no file {os.fspath(table)}, looked for in {os.getcwd()}") from error
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:

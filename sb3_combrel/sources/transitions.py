@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -13,8 +12,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_combrel.common.attributes import attribute, list_of
 from sb3_combrel.common.checks import as_count
-from sb3_combrel.common.periodic import check_periods, flag_array, periodic_flags
+from sb3_combrel.common.periodic import check_periods, flag_array
 from sb3_combrel.common.scaling import Bounds, Limits, StateScaling
 from sb3_combrel.common.version import __version__
 
@@ -146,27 +146,14 @@ def full_id(env: Any) -> Any:
 
 def task_names(env: AnyEnv) -> dict[str, tuple[Any, ...]]:
     """``state_names`` and ``action_names`` of a task, and which of its states are ``periodic``, as far as it says so."""
-    given = {name: _attribute(env, name) for name in ("state_names", "action_names")}
-    names = {name: tuple(value) for name, value in given.items() if value is not None}
-    periodic = _attribute(env, "periodic")
-    if periodic is not None:
-        with suppress(ValueError):
-            names["periodic"] = periodic_flags(periodic, (env.observation_space.shape or (0,))[0])
-    return names
-
-
-def _attribute(env: AnyEnv, name: str) -> Any:
-    """An attribute of an environment or of one of its wrappers, None if there is none."""
-    if isinstance(env, VecEnv):
-        return env.get_attr(name, 0)[0] if env.has_attr(name) else None
-    try:
-        return env.get_wrapper_attr(name)
-    except AttributeError:
-        return None
+    names = {name: list_of(env, name, str) for name in ("state_names", "action_names")}
+    flags = list_of(env, "periodic", bool, np.bool_)
+    found = {**names, "periodic": flags and [bool(flag) for flag in flags]}
+    return {name: tuple(values) for name, values in found.items() if values}
 
 
 def describe_origin(env: AnyEnv, recorder: str, seed: int | None) -> dict[str, Any]:
     """Where instances come from: id of the environment, what acted in it (``recorder``), seed and version of this package."""
-    spec = _attribute(env, "spec")
+    spec = attribute(env, "spec")
     package = f"sb3-combrel {__version__}"
     return {"env": None if spec is None else spec.id, "recorder": recorder, "seed": seed, "package": package}

@@ -50,7 +50,7 @@ class DashboardCallback(BaseCallback):
     """Shows in TensorBoard what Fitted R-Max has learned and what was transferred; what is learned is the same without it.
 
     ``FittedRMax.learn`` adds one where there is a TensorBoard log and none was given; its pictures come at the end, and before
-    where they take less than a twentieth of the time. Without such a log it does nothing.
+    where all of them take at most 15% of the time. Without such a log it does nothing.
 
     - Scalars: ``rollout/`` at the end of every episode, ``time/`` with every log of the algorithm (``log_interval``; None: no
       scalars); ``model/``, ``planner/``, ``transfer/`` and, of a source as prior, ``evidence/``, as how many instances it
@@ -96,10 +96,11 @@ class DashboardCallback(BaseCallback):
         n_eval_episodes: int = 5,
     ):
         super().__init__(verbose)
-        if picture_freq != AUTO:
-            check_count("picture_freq", picture_freq, none_allowed=True)
-        if eval_freq != AUTO:
-            check_count("eval_freq", eval_freq)
+        for name, freq in (("picture_freq", picture_freq), ("eval_freq", eval_freq)):
+            if isinstance(freq, str) and freq != AUTO:
+                raise ValueError(f'{name} must be a whole number of at least 1 or "{AUTO}", got {freq!r}')
+            if freq != AUTO:
+                check_count(name, freq, none_allowed=name == "picture_freq")
         check_count("n_eval_episodes", n_eval_episodes)
         check_positive("scalar_share", scalar_share, max=1.0)
         check_positive("picture_share", picture_share, max=1.0)

@@ -110,3 +110,9 @@ def test_proposed_bounds_hold_what_was_observed_and_are_not_much_wider(low, widt
     assert least <= observed[0, 0] + allowed and most >= observed[1, 0] - allowed
     assert most - least <= 1.03 * whole + 1e-9
     assert (least == low or below > 0.0) and (most == low + width or above > 0.0)
+
+
+@pytest.mark.parametrize("value", [0.0, 3.0, -1e17, 1e25, 1e300])
+def test_a_variable_that_never_changes_has_a_scale_however_large_it_is(value):
+    scaling = StateScaling.from_observed((np.full(1, -np.inf), np.full(1, np.inf)), np.full((3, 1), value))
+    assert scaling.low[0] < value < scaling.high[0]

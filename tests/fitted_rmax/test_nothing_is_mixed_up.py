@@ -7,6 +7,8 @@ from helpers import naive_transfer as naive
 from helpers.agents import make_agent
 from helpers.walk import Walk, small, walk_source
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping, SourceInstances, SparseCodingMapping
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
@@ -313,3 +315,35 @@ def test_pairs_of_all_actions_hear_of_an_end_that_counts_no_more(longer):
     # At the grid's last point one stays for ever now.
     rewards = agent.mdp.arrays.reward.T.ravel()[near[agent.model.known[near]]]
     assert len(rewards) > 10 and np.isin(np.round(rewards, 6), [-1.0, -np.inf]).all()
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_a_vectorised_environment_may_return_one_array_as_well(n_envs):
+    models = [small(make_vec_env(which, n_envs, seed=0)).learn(300) for which in (OneArray, Walk)]
+    found, right = (model.source_instances() for model in models)
+    assert right.terminated.any()
+    for name in ("states", "next_states", "terminated"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(right, name))
+    recorded = [SourceInstances.record(None, make_vec_env(which, n_envs), 200, 0) for which in (OneArray, Walk)]
+    np.testing.assert_array_equal(*(source.next_states for source in recorded))
+
+
+def test_one_array_in_another_process_is_warned_of():
+    env = SubprocVecEnv([OneArray], start_method="spawn")
+    try:
+        with pytest.warns(UserWarning, match="the last observation of an episode equals the first of the next: .*copy"):
+            small(env).learn(60)
+    finally:
+        env.close()
+
+
+def test_what_told_states_apart_stays_told_when_max_instances_has_removed_it():
+    agent, rng = make_agent(2, 2, max_instances=40), np.random.default_rng(0)
+    for k in range(400):
+        state = rng.random(2)
+        agent.update(state, k % 2, -1.0, np.clip(state + np.array([0.05, 0.0]), 0.0, 1.0), k == 20)
+    known = agent.model.known.copy()
+    assert len(agent.model.ends.state) == 0 and agent.rewards.n_ended == 1
+    agent.rescale(agent.task.scaling, agent.task.shared_scaling)
+    np.testing.assert_array_equal(agent.model.known, agent.model.own_weight >= agent.model._threshold)
+    assert agent.model.known.mean() > 0.99 * known.mean()

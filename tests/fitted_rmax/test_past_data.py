@@ -379,3 +379,42 @@ def test_a_discount_that_past_data_change_is_that_of_every_row():
     used = np.arange(rows.weight.shape[2]) < rows.length[..., None]
     assert gamma == 0.99 and rows.modelled.sum() > 50
     assert np.where(used, rows.weight, 0.0).sum(axis=2).max() <= gamma + 1e-12
+
+
+class Back(gym.Env):
+    """To and fro along a line without bounds, for ever."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,))
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = self.np_random.uniform(-1.0, 1.0, 2)
+        return np.float32(self.x), {}
+
+    def step(self, action):
+        self.x = np.clip(self.x + np.array([0.2 * (2 * action - 1), 0.0]), -1.0, 1.0)
+        return np.float32(self.x), -1.0, False, False, {}
+
+
+def test_the_first_end_that_is_loaded_makes_known_what_suffices_then():
+    agent = (
+        model(gym.wrappers.TimeLimit(Back(), 20))
+        .learn(120)
+        .load_instances(SourceInstances([[0.0, 0.0]], [0], [-1.0], [[0.05, 0.0]], [True], [-1, -1], [1, 1], 2))
+        .agent
+    )
+    enough = agent.model.own_weight >= agent.model._threshold
+    assert enough.sum() > 1000
+    np.testing.assert_array_equal(agent.model.known, enough)
+
+
+def test_pairs_of_all_actions_hear_of_ends_that_are_loaded_later():
+    rng, agent = np.random.default_rng(1), make_agent(2, 2, gamma=0.99, max_value=0.0)
+    states = rng.random((400, 2))
+    agent.take_in([(state, 0, -1.0, np.clip(state - [0.04, 0.0], 0.0, 1.0), False) for state in states])
+    agent.take_in([(np.array([0.46, 0.5]), 1, -50.0, np.array([0.5, 0.5]), True)])
+    near = (np.abs(agent.grid.points() - 0.5) < 0.02).all(axis=1)
+    fitted_at = agent.model.pairs.fitted_at[: agent.grid.n_points]
+    assert near.sum() > 3 and agent.model.known[: agent.grid.n_points][near].all()
+    np.testing.assert_array_equal(fitted_at[near], 401)

@@ -264,3 +264,21 @@ def test_the_row_of_a_last_state_may_say_that_it_is_an_end(name, recwarn):
     source = SourceInstances.from_table(table.assign(truncated=[0, 0, 0, 0, 0, 1]))
     assert source.terminated.tolist() == [False, True, False, False] and len(source) == 4
     np.testing.assert_allclose(source.next_states[:, 0], [0.1, 0.2] * 2)
+
+
+@pytest.mark.parametrize("name", ["None", "NA", "null", "N/A", "none"])
+def test_actions_may_have_names_that_pandas_takes_for_missing(name, tmp_path):
+    text = f"x,action,reward,terminated\n0,Left,-1,0\n1,Left,-1,0\n2,{name},-1,1\n3,,,\n0,Left,-1,0\n1,,,\n"
+    (tmp_path / "log.csv").write_text(text)
+    source = SourceInstances.from_table(tmp_path / "log.csv", action_names=[name, "Left"])
+    np.testing.assert_array_equal(source.states.ravel(), [0.0, 1.0, 2.0, 0.0])
+    np.testing.assert_array_equal(source.actions, [1, 1, 0, 1])
+    np.testing.assert_array_equal(source.terminated, [False, False, True, False])
+
+
+def test_numbers_come_back_from_a_file_to_the_last_digit(tmp_path):
+    source = SourceInstances.record(None, "MountainCar-v0", 300, 0)
+    source.to_table().to_csv(tmp_path / "log.csv", index=False)
+    read = SourceInstances.from_table(tmp_path / "log.csv", bounds=(source.low, source.high), n_actions=3)
+    np.testing.assert_array_equal(read.states, source.states)
+    np.testing.assert_array_equal(read.next_states, source.next_states)

@@ -175,3 +175,22 @@ class TestSourceRecorder:
             PPO("MlpPolicy", "Pendulum-v1").learn(100, callback=recorder)
         with pytest.raises(ValueError, match="nothing has been recorded"):
             recorder.source_instances()
+
+
+class Renamed(gym.Wrapper):
+    """Has names that do not fit it, as wrappers do that add a variable."""
+
+    def __init__(self, env, names):
+        super().__init__(env)
+        self.state_names = names
+
+
+@pytest.mark.parametrize("names", [("place",), "ab", lambda: ["place", "time"], {0: "place", 1: "time"}])
+def test_names_that_do_not_fit_are_warned_of_and_ignored(names):
+    with pytest.warns(UserWarning, match="state_names=.* is not one str for each of the 2 variables, and is ignored"):
+        source = SourceInstances.record(None, Renamed(Corridor(), names), 50, 0)
+    assert source.state_names == ("s0", "s1") and source.action_names == ("back", "forth")
+    recorder = SourceRecorder()
+    with pytest.warns(UserWarning, match="is ignored"):
+        DQN("MlpPolicy", DummyVecEnv([lambda: Renamed(Corridor(), names)]), device="cpu").learn(60, callback=recorder)
+    assert recorder.source_instances().state_names == ("s0", "s1")

@@ -104,7 +104,7 @@ def test_the_environment_that_is_learned_is_refused(layers, tmp_path):
 
 
 def test_what_cannot_be_evaluated_is_refused_before_the_first_step(tmp_path):
-    for name, value in (("eval_freq", 0), ("eval_freq", None), ("n_eval_episodes", 0)):
+    for name, value in (("eval_freq", 0), ("eval_freq", None), ("n_eval_episodes", 0), ("picture_freq", "often")):
         with pytest.raises(ValueError, match=f"{name} must be"):
             DashboardCallback(**{name: value})
     other = Still(np.float32([0]), np.float32([1]))
