@@ -147,7 +147,9 @@ class FittedRMaxPolicy(BasePolicy):
         if problems:
             raise RuntimeError(f"parameters do not fit: {'; '.join(problems)}")
         fixed = self.scales.scaling if self.scales.fixed else None
-        self._replace_learned({name: given[name].detach().cpu().numpy().astype(np.float64) for name in expected})
+        # Row by row again: for arrays in another order all would be compiled once more.
+        arrays = {name: given[name].detach().cpu().numpy().astype(np.float64, order="C") for name in expected}
+        self._replace_learned(arrays)
         if fixed is not None and fixed != self.scales.scaling:
             # The user gives other bounds than those of the file.
             self.scales.scaling = fixed

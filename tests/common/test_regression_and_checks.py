@@ -18,11 +18,11 @@ problems = st.tuples(st.integers(0, 10**6), st.integers(1, 5), st.integers(1, 60
 
 
 @compiled
-def fit_and_predict(at, instances, kernel, fit, away, found):
+def fit_and_predict(at, action, instances, kernel, fit, away, found):
     """Fit around a state; how many instances, their weight, and the numbers predicted ``away`` from there."""
-    n = nearest_instances(instances, 0, at, kernel.reach, fit.item, fit.distance)
+    n = nearest_instances(instances, action, at, kernel.reach, fit.item, fit.distance)
     if n > 0:
-        fit_around(at, 0, n, instances, kernel, fit)
+        fit_around(at, action, n, instances, kernel, fit)
         for v in range(len(found)):
             found[v] = number_at(fit, v, away)
     return n, known_weight(fit, n, kernel)
@@ -45,7 +45,7 @@ def test_a_fit_is_that_of_least_squares_to_the_nearest_instances_within_reach(pr
     kernel, fit = Kernel(-1.0 / breadth**2, 3.0 * breadth**2, n_neighbors, 0.01), LocalFit.empty(n_neighbors, d)
     for at in [*rng.uniform(-0.1, 1.1, (2, d)), instances.state[0, 0].copy()]:
         away, found = rng.normal(0.0, 0.1, d), np.empty(d + 1)
-        length, weight = fit_and_predict(at, instances, kernel, fit, away, found)
+        length, weight = fit_and_predict(at, 0, instances, kernel, fit, away, found)
         apart = differences(instances.state[0, :n], at, instances.periodic)
         squared = (apart**2).sum(axis=1)
         nearest = [i for i in np.argsort(squared, kind="stable") if squared[i] <= kernel.reach][:n_neighbors]
@@ -67,7 +67,7 @@ def test_predicted_numbers_stay_within_the_range_of_the_instances_and_ends_do_no
     instances = Instances.of_rows(1, np.zeros(4, dtype=int), states, states.copy(), np.array([-1.0, -1.0, -1.0, 100.0]), ended)
     kernel, fit, found = Kernel(-4.0, 1.0, 10, 0.01), LocalFit.empty(10, 1), np.empty(2)
     for away, expected in ((0.0, 0.15), (0.1, 0.25), (5.0, 0.3), (-5.0, 0.0)):
-        fit_and_predict(np.array([0.15]), instances, kernel, fit, np.array([away]), found)
+        fit_and_predict(np.array([0.15]), 0, instances, kernel, fit, np.array([away]), found)
         np.testing.assert_allclose(found, [expected, -1.0], atol=2e-3)
 
 

@@ -324,3 +324,25 @@ def test_a_model_without_transfer_cannot_take_one_up_when_loaded(tmp_path):
     with pytest.raises(ValueError, match="transfer") as error:
         FittedRMax.load(tmp_path / "model", transfer=METHODS["COMBREL"]())
     assert "\n" not in str(error.value)
+
+
+def layouts(value, seen):
+    """How all arrays that an object holds are laid out: compiled code is compiled once more for each layout."""
+    if isinstance(value, np.ndarray):
+        return str(value.dtype), value.ndim, value.flags.c_contiguous, value.flags.writeable
+    if id(value) in seen or isinstance(value, str | int | float):
+        return None
+    seen.add(id(value))
+    if isinstance(value, list | tuple):
+        return [layouts(each, seen) for each in value]
+    return {name: layouts(each, seen) for name, each in vars(value).items()} if hasattr(value, "__dict__") else None
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_nothing_is_compiled_once_more_for_a_loaded_model(degree, tmp_path):
+    model = small(degree=degree).learn(40)
+    model.save(tmp_path / "model")
+    loaded = FittedRMax.load(tmp_path / "model")
+    for name in ("grid", "mdp", "planner", "model"):
+        one, other = (getattr(each.agent, name) for each in (model, loaded))
+        assert layouts(other, set()) == layouts(one, set()), name
