@@ -49,6 +49,13 @@ class OwnArrays(gym.Wrapper[Any, Any, Any, Any]):
                 raise ValueError(f"step must return {name} as {wanted}, not as text, got {value!r}")
         return self._own(observation), reward, terminated, truncated, info
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        # What ``VecEnv.set_attr`` sets is the environment's, as it would be without this.
+        if name.startswith("_") or "env" not in vars(self) or hasattr(type(self), name):
+            super().__setattr__(name, value)
+        else:
+            setattr(self.env, name, value)
+
     def _own(self, observation: Any) -> np.ndarray:
         copied = np.array(observation)
         if copied.shape != self.observation_space.shape:

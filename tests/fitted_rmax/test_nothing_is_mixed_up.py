@@ -8,7 +8,7 @@ from helpers.agents import make_agent
 from helpers.walk import Walk, small, walk_source
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_combrel import COMBREL, TIMBREL, FittedRMax, InterTaskMapping, SourceInstances, SparseCodingMapping
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
@@ -326,6 +326,20 @@ def test_a_vectorised_environment_may_return_one_array_as_well(n_envs):
         np.testing.assert_array_equal(getattr(found, name), getattr(right, name))
     recorded = [SourceInstances.record(None, make_vec_env(which, n_envs), 200, 0) for which in (OneArray, Walk)]
     np.testing.assert_array_equal(*(source.next_states for source in recorded))
+
+
+def test_attributes_are_set_and_methods_called_in_a_vectorised_environment_as_without_a_learner():
+    vec = DummyVecEnv([lambda: Walk(limit=9)] * 2)
+    inner = list(vec.envs)
+    model = small(vec).learn(20)
+    small(vec)
+    vec.set_attr("limit", 5, indices=[1])
+    model.get_env().set_attr("hardness", 2.0)
+    assert [each.limit for each in inner] == vec.get_attr("limit") == [9, 5]
+    assert [each.hardness for each in inner] == [2.0, 2.0] and vec.env_is_wrapped(Walk) == [False, False]
+    assert [each.unwrapped for each in vec.envs] == inner == [each.env for each in vec.envs], "and wrapped once"
+    vec.reset()
+    assert [vec.step([1, 1])[2].tolist() for _ in range(5)][-1] == [False, True]
 
 
 def test_one_array_in_another_process_is_warned_of():
