@@ -78,7 +78,10 @@ def test_hyperparameters_are_those_of_the_zoo(name, env_id):
     assert {key: getattr(model.policy, key) for key in network} == network
 
 
-@pytest.mark.parametrize("algorithm", baselines.ALGORITHMS)
+LONG = [pytest.param(name, marks=[pytest.mark.long] * (name != "DQN")) for name in baselines.ALGORITHMS]
+
+
+@pytest.mark.parametrize("algorithm", LONG)
 def test_the_same_job_has_the_same_result(algorithm, source, monkeypatch):
     if algorithm == baselines.QUANTILE:
         pytest.importorskip("sb3_contrib")

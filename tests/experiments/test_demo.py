@@ -72,6 +72,7 @@ class TestDemo:
         with gymnasium.make("combrel/MountainCar4D-v0") as env:
             assert env.action_space.contains(int(model.predict(env.reset(seed=0)[0], deterministic=True)[0]))
 
+    @pytest.mark.long
     def test_a_second_call_learns_nothing_again_and_mixes_no_settings(self, folder, no_film):
         before = {path: path.stat().st_mtime_ns for path in folder.glob("runs/*")}
         status, written = run_tiny_demo(folder)
@@ -93,6 +94,7 @@ class TestDemo:
         ]
         assert {(row["steps"], row["reached_goal"]) for row in rows} == {("60", "0")}
 
+    @pytest.mark.long
     def test_fresh_deletes_earlier_results_and_nothing_of_the_users(self, folder, no_film):
         mine = [folder / name for name in ("notes.txt", "sources/mine.npz", "runs/PPO_1/log", "tensorboard/PPO_1/log")]
         for file in mine:

@@ -27,6 +27,7 @@ def test_every_pair_with_one_source_has_its_environment():
     assert set(SOURCES) == {name for name, pair in PAIRS.items() if len(pair.sources) == 1}
 
 
+@pytest.mark.long
 def test_a_network_that_has_learnt_the_source_acts_otherwise_than_one_from_nothing(tmp_path):
     arguments = {"seeds": [1], "budgets": [5, 10], "source_steps": 60, "output": tmp_path / "a", "table": tmp_path / "a.csv"}
     fine_tuning.fine_tuning(["mirrored-car"], **arguments)

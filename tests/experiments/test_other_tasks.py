@@ -30,6 +30,7 @@ def test_few_actions_have_the_limits_and_what_lies_between():
     assert pushed == {(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)}
 
 
+@pytest.mark.long
 def test_returns_are_in_the_makers_unit_and_played_by_the_frozen_policy():
     class Always:
         """Acts as SB3's models do, without learning anything."""

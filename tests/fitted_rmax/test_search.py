@@ -60,7 +60,7 @@ def test_worth_is_that_of_a_place_so_many_steps_further_away(places, reward, gam
     np.testing.assert_allclose(worth_after_visits(worth, visits, reward, gamma), expected, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
 def test_what_is_smaller_than_the_kernel_is_found(seed, monkeypatch):
     found = searcher(seed=seed).learn(2_000).agent
     assert found.rewards.n_ended > 10

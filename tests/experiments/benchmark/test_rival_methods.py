@@ -85,6 +85,7 @@ def test_an_action_without_data_is_worth_the_least():
     assert (values_of(policy, np.array([[0.0, 0.0], [1.0, 1.0]])) == policy.values.min()).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["GAME", "BELLMAN"])
 def test_they_are_found_by_name_and_learn(name):
     method = method_of(f"sb3_combrel.experiments.benchmark.rival_methods:{name}")

@@ -157,7 +157,10 @@ class TestTargets:
 
 # What a run records, compared with a plain replay of the same run; and the jobs of the diagnosis.
 N_EPISODES = 3
-METHODS = [("mountain_car", m.COMBREL_WHOLE), ("icub", m.COMBREL_PLAIN)]
+METHODS = [
+    pytest.param(("mountain_car", m.COMBREL_WHOLE), id="whole mappings", marks=pytest.mark.long),
+    pytest.param(("icub", m.COMBREL_PLAIN), id="iCub"),
+]
 
 
 def job_of(short, domain, method, sources):
@@ -204,7 +207,7 @@ def with_states(env):
     return env, states
 
 
-@pytest.fixture(scope="module", params=METHODS, ids=[f"{domain} {method}" for domain, method in METHODS])
+@pytest.fixture(scope="module", params=METHODS)
 def run(request, short, sources):
     """A job, its result, a model that has learned the same, and what its learning was seen to do."""
     job = job_of(short, *request.param, sources)

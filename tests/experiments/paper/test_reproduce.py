@@ -74,6 +74,7 @@ class TestChain:
         reproduce("fig4", output=folder)
         assert files_in(folder) == files_in(complete)
 
+    @pytest.mark.long
     def test_a_method_that_has_a_mapping_of_the_runs_of_another(self, short, tmp_path, monkeypatch):
         of_robot = {"icub": ("COMBREL", "TIMBREL frequent", "oracle mapping")}
         monkeypatch.setitem(TARGETS, "fig5", replace(TARGETS["fig5"], methods=of_robot))
