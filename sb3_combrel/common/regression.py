@@ -206,32 +206,45 @@ def fit_around(at, action, length, instances, kernel, fit):
 
 
 @compiled
-def write_residuals(length, kernel, fit):
-    """Write by how much effects differ from what is fitted of them; the largest squared length of these."""
+def largest_residual(length, kernel, fit):
+    """The largest squared length of what effects differ by from what is fitted of them."""
     d = fit.residual.shape[1]
     per_unit = np.sqrt(-kernel_scale(fit, length, kernel))
     largest = 0.0
     for k in range(length):
         square = 0.0
         for v in range(d):
+            # In parts of a breadth: a division for each slope would take most of the time.
+            residual = (fit.number[v, k // GROUP, k % GROUP] - fit.solution[0, v]) * per_unit
+            for j in range(1, d + 1):
+                residual -= fit.solution[j, v] * fit.z[j, k // GROUP, k % GROUP]
+            square += residual * residual
+        largest = max(largest, square)
+    return largest / (per_unit * per_unit)
+
+
+@inlined
+def write_residuals(length, kernel, fit):
+    """Write by how much effects differ from what is fitted of them."""
+    d = fit.residual.shape[1]
+    per_unit = np.sqrt(-kernel_scale(fit, length, kernel))
+    for k in range(length):
+        for v in range(d):
             residual = fit.number[v, k // GROUP, k % GROUP] - fit.solution[0, v]
             for j in range(1, d + 1):
                 residual -= fit.solution[j, v] * fit.z[j, k // GROUP, k % GROUP] / per_unit
             fit.residual[k, v] = residual
-            square += residual * residual
-        largest = max(largest, square)
-    fit.noisy[0] = np.nan
-    return largest
 
 
 @compiled
-def write_noise(length, fit):
+def write_noise(length, kernel, fit):
     """Write by how much residuals differ from those of the instance that is nearest to each, in parts of the root of 2.
 
     Where a line fits badly, as at a wall, residuals are large, and nearly the same beside each other; noise is not (Rice 1984,
     "Bandwidth choice for nonparametric regression"). No noise is larger than the root of 2 times the largest residual.
     """
     d = fit.residual.shape[1]
+    write_residuals(length, kernel, fit)
     total, sum_of_squares = 0.0, 0.0
     for k in range(length):
         nearest, least = k, np.inf

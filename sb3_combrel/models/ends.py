@@ -92,17 +92,28 @@ def reach_of(nearest, outcome_breadth):
     return nearest + NEGLIGIBLE * min(outcome_breadth, nearest + ROUNDING)
 
 
+@inlined
+def none_decides(of_end, nearest, noise, outcome_breadth):
+    """Whether all ends are too far to decide what arriving means, even ``noise`` away from there.
+
+    :param of_end: squared distance of the nearest end, ``nearest``: of some arrival
+    """
+    apart, arrived = max(np.sqrt(of_end) - noise, 0.0), np.sqrt(nearest) + noise
+    return apart * apart > reach_of(arrived * arrived, outcome_breadth)
+
+
 @compiled
-def distance_of_nearest(state, nearest, of_end, outcome_breadth, arrivals, hint):
+def distance_of_nearest(state, nearest, of_end, noise, outcome_breadth, arrivals, hint):
     """The squared distance of the nearest arrival, or of one that is so near that no end decides.
 
     :param nearest: that of some arrival; ``of_end``: that of the nearest end
+    :param noise: how far from ``state`` one may arrive
     """
     wraps = any_periodic(arrivals.periodic)
     if hint[1] < arrivals.size[hint[0]]:
         nearest = min(nearest, squared_distance(state, arrivals.state[hint[0], hint[1]], arrivals.periodic, wraps))
     for action in range(len(arrivals.size)):
-        if of_end > reach_of(nearest, outcome_breadth):
+        if none_decides(of_end, nearest, noise, outcome_breadth):
             break
         for block in range(measure_blocks(arrivals, action, state)):
             if arrivals.gap[block] < nearest:
@@ -123,7 +134,7 @@ def end_at(state, near, outcome_breadth, arrivals, ends, found):
     found[0], found[1] = 0.0, 0.0
     of_end = squared_distance_of_end(state, ends, arrivals.periodic)
     if of_end <= reach_of(near, outcome_breadth):
-        nearest = distance_of_nearest(state, min(near, of_end), of_end, outcome_breadth, arrivals, ends.hint)
+        nearest = distance_of_nearest(state, min(near, of_end), of_end, 0.0, outcome_breadth, arrivals, ends.hint)
         weigh_ends(state, of_end, nearest, outcome_breadth, arrivals, found)
 
 

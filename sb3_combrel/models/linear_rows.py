@@ -16,13 +16,21 @@ from sb3_combrel.common.regression import (
     fit_around,
     join_prior,
     known_weight,
+    largest_residual,
     leverage_of,
     number_at,
     write_noise,
-    write_residuals,
 )
 from sb3_combrel.common.transferred import TransferredInstances
-from sb3_combrel.models.ends import Ends, distance_of_nearest, end_at, reach_of, squared_distance_of_end, weigh_ends
+from sb3_combrel.models.ends import (
+    Ends,
+    distance_of_nearest,
+    end_at,
+    none_decides,
+    reach_of,
+    squared_distance_of_end,
+    weigh_ends,
+)
 from sb3_combrel.models.grid_model import add_to_row, total_weight
 from sb3_combrel.models.grid_points import PairArrays, note_fit
 from sb3_combrel.planning.grid import (
@@ -78,10 +86,11 @@ def look_around(at, action, length, experience, kernel, fit):
     if of_end == np.inf:
         return Around(length, 0.0, np.inf, 0.0)
     near = squared_distance(at, arrivals.state[action, fit.item[0]], arrivals.periodic, True)
-    return Around(length, np.sqrt(near), np.sqrt(of_end), np.sqrt(2.0 * write_residuals(length, kernel, fit)))
+    fit.noisy[0] = np.nan
+    return Around(length, np.sqrt(near), np.sqrt(of_end), np.sqrt(2.0 * largest_residual(length, kernel, fit)))
 
 
-@compiled
+@inlined
 def outcome_of(fit, away, to, moved, around, experience, kernel, end):
     """Expected reward of a step from ``away`` of a fit's state to ``to``; writes to ``end`` the probability that it ends.
 
@@ -106,14 +115,14 @@ def mean_end(fit, to, near, around, experience, kernel, end):
     :param near: squared distance of some arrival
     """
     _, arrivals, ends = experience
-    of_end = squared_distance_of_end(to, ends, arrivals.periodic)
-    apart = max(np.sqrt(of_end) - around.noise, 0.0)
-    if apart * apart > reach_of((np.sqrt(near) + around.noise) ** 2, kernel.outcome_breadth):
+    of_end, most = squared_distance_of_end(to, ends, arrivals.periodic), around.noise * around.noise
+    if none_decides(of_end, near, around.noise, kernel.outcome_breadth):
         return
-    most = around.noise * around.noise
-    nearest = distance_of_nearest(to, max(most, near), 0.0, kernel.outcome_breadth, arrivals, ends.hint)
+    nearest = distance_of_nearest(to, max(most, near), of_end, around.noise, kernel.outcome_breadth, arrivals, ends.hint)
+    if none_decides(of_end, nearest, around.noise, kernel.outcome_breadth):
+        return
     if nearest < most and np.isnan(fit.noisy[0]):
-        write_noise(around.length, fit)
+        write_noise(around.length, kernel, fit)
     # Where no arrival is as near as the noise is large, the mean effect says where one arrives.
     if nearest >= most or fit.noisy[0] <= nearest:
         weigh_ends(to, of_end, nearest, kernel.outcome_breadth, arrivals, end)

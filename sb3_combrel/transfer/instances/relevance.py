@@ -126,7 +126,7 @@ def _mean_distance(weight, total, mu, bandwidth):
         distance += np.sqrt(-bandwidth * np.log(heaviest))
         n_taken += 1
         weight[0] = weight[n - n_taken]
-        _sift_down(weight, 0, n - n_taken)
+        _sift_down(weight, np.int64(0), n - n_taken)
     return distance / max(n_taken, 1)
 
 
