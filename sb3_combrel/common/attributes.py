@@ -21,6 +21,16 @@ def attribute(env: Any, name: str) -> Any:
         return None
 
 
+def names_of(env: Any) -> dict[str, list[str]]:
+    """Names of state variables and of actions, where an environment has as many of them as it must have."""
+    return {name: names for name in ("state_names", "action_names") if (names := list_of(env, name, str))}
+
+
+def periodic_of(env: Any) -> list[bool] | None:
+    """Which state variables are periodic, where an environment says so in its attribute ``periodic``."""
+    return [bool(flag) for flag in list_of(env, "periodic", bool, np.bool_) or ()] or None
+
+
 def list_of(env: Any, name: str, *types: type) -> list[Any] | None:
     """An attribute, if it is a value for each state variable, or for each action; a warning if it is something else."""
     what = "action" if name == "action_names" else "variable"

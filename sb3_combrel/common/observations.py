@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal
 from typing import Any
 
@@ -12,6 +13,7 @@ from gymnasium import spaces
 
 from sb3_combrel.common.compiled import entry_point
 from sb3_combrel.common.scaling import StateScaling
+from sb3_combrel.common.user_warnings import warn_user
 
 # Excess over the bounds, in unit coordinates, that rounding can explain.
 ROUNDING = 1e-6
@@ -62,6 +64,17 @@ class OwnArrays(gym.Wrapper[Any, Any, Any, Any]):
             wanted = f"the shape {self.observation_space.shape} of env.observation_space"
             raise ValueError(f"an observation must have {wanted}, got {observation!r}")
         return copied
+
+
+def last_observation(info: Mapping[str, Any], first: Any) -> Any:
+    """What an episode has ended with, before its environment was reset to ``first``; a warning if it is the same."""
+    last = info["terminal_observation"]
+    if np.array_equal(last, first):
+        warn_user(
+            "the last observation of an episode equals the first of the next: if that is not so in your task, the "
+            "environment returns one array each time and changes it; let it return observation.copy()"
+        )
+    return last
 
 
 @entry_point

@@ -19,6 +19,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from sb3_combrel.common.attributes import names_of, periodic_of
 from sb3_combrel.common.checks import as_count, check_boolean, check_count
 from sb3_combrel.common.observations import with_own_arrays
 from sb3_combrel.common.serialisation import to_plain
@@ -30,8 +31,6 @@ from sb3_combrel.fitted_rmax.progress import ProgressWatch
 from sb3_combrel.fitted_rmax.settings import FittedRMaxSettings
 from sb3_combrel.fitted_rmax.vec_envs import (
     joined_names,
-    names_of,
-    periodic_of,
     refuse_running_means,
     true_outcomes,
     warn_of_shared,

@@ -9,13 +9,8 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_combrel.common.attributes import list_of
+from sb3_combrel.common.observations import last_observation
 from sb3_combrel.common.user_warnings import warn_user
-
-
-def names_of(env: VecEnv) -> dict[str, Any]:
-    """Return names of state variables and actions, where the environment has as many of them as it must have."""
-    return {name: names for name in ("state_names", "action_names") if (names := list_of(env, name, str))}
 
 
 def joined_names(saved: dict[str, Any], of_env: dict[str, Any]) -> dict[str, Any]:
@@ -24,11 +19,6 @@ def joined_names(saved: dict[str, Any], of_env: dict[str, Any]) -> dict[str, Any
         if names != saved.get(key, names):
             raise ValueError(f"env must have the {key} of the model, {saved[key]}, got {names}")
     return {**saved, **of_env}
-
-
-def periodic_of(env: VecEnv) -> list[bool] | None:
-    """Return which state variables are periodic, where the environment says so in its attribute ``periodic``."""
-    return [bool(flag) for flag in list_of(env, "periodic", bool, np.bool_) or ()] or None
 
 
 def warn_of_shared(env: VecEnv, callback: BaseCallback) -> None:
@@ -73,12 +63,6 @@ def true_outcomes(new_obs: Any, infos: list[dict[str, Any]], ended: list[int]) -
     """
     next_obs, terminated = np.array(new_obs), [False] * len(infos)
     for e in ended:
-        last = infos[e]["terminal_observation"]
-        if np.array_equal(last, next_obs[e]):
-            warn_user(
-                "the last observation of an episode equals the first of the next: if that is not so in your task, the "
-                "environment returns one array each time and changes it; let it return observation.copy()"
-            )
-        next_obs[e] = last
+        next_obs[e] = last_observation(infos[e], new_obs[e])
         terminated[e] = not infos[e].get("TimeLimit.truncated", False)
     return next_obs, terminated

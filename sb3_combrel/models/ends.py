@@ -96,9 +96,9 @@ def reach_of(nearest, outcome_breadth):
 def none_decides(of_end, nearest, noise, outcome_breadth):
     """Whether all ends are too far to decide what arriving means, even ``noise`` away from there.
 
-    :param of_end: squared distance of the nearest end, ``nearest``: of some arrival
+    :param of_end: how far the nearest end is, no less; ``nearest``: some arrival, no more
     """
-    apart, arrived = max(np.sqrt(of_end) - noise, 0.0), np.sqrt(nearest) + noise
+    apart, arrived = max(of_end - noise, 0.0), nearest + noise
     return apart * apart > reach_of(arrived * arrived, outcome_breadth)
 
 
@@ -113,7 +113,7 @@ def distance_of_nearest(state, nearest, of_end, noise, outcome_breadth, arrivals
     if hint[1] < arrivals.size[hint[0]]:
         nearest = min(nearest, squared_distance(state, arrivals.state[hint[0], hint[1]], arrivals.periodic, wraps))
     for action in range(len(arrivals.size)):
-        if none_decides(of_end, nearest, noise, outcome_breadth):
+        if none_decides(np.sqrt(of_end), np.sqrt(nearest), noise, outcome_breadth):
             break
         for block in range(measure_blocks(arrivals, action, state)):
             if arrivals.gap[block] < nearest:

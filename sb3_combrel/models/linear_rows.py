@@ -27,7 +27,6 @@ from sb3_combrel.models.ends import (
     distance_of_nearest,
     end_at,
     none_decides,
-    reach_of,
     squared_distance_of_end,
     weigh_ends,
 )
@@ -102,9 +101,9 @@ def outcome_of(fit, away, to, moved, around, experience, kernel, end):
         return reward
     end[0], end[1] = 0.0, 0.0
     # Where even the nearest end there could be is too far to decide, none is searched for.
-    apart, arrived = max(around.of_end - moved - around.noise, 0.0), (moved + around.near + around.noise) ** 2
-    if apart * apart <= reach_of(arrived, kernel.outcome_breadth):
-        mean_end(fit, to, (moved + around.near) ** 2, around, experience, kernel, end)
+    near = moved + around.near
+    if not none_decides(around.of_end - moved, near, around.noise, kernel.outcome_breadth):
+        mean_end(fit, to, near, around, experience, kernel, end)
     return (1.0 - end[0]) * reward + end[0] * end[1]
 
 
@@ -112,20 +111,21 @@ def outcome_of(fit, away, to, moved, around, experience, kernel, end):
 def mean_end(fit, to, near, around, experience, kernel, end):
     """Write to ``end`` what arriving at ``to`` means, or, with noise, around it (see ``models.ends``).
 
-    :param near: squared distance of some arrival
+    :param near: how far some arrival is, no more
     """
     _, arrivals, ends = experience
-    of_end, most = squared_distance_of_end(to, ends, arrivals.periodic), around.noise * around.noise
-    if none_decides(of_end, near, around.noise, kernel.outcome_breadth):
+    noise, breadth = around.noise, kernel.outcome_breadth
+    of_end, most = squared_distance_of_end(to, ends, arrivals.periodic), noise * noise
+    if none_decides(np.sqrt(of_end), near, noise, breadth):
         return
-    nearest = distance_of_nearest(to, max(most, near), of_end, around.noise, kernel.outcome_breadth, arrivals, ends.hint)
-    if none_decides(of_end, nearest, around.noise, kernel.outcome_breadth):
+    nearest = distance_of_nearest(to, max(most, near * near), of_end, noise, breadth, arrivals, ends.hint)
+    if none_decides(np.sqrt(of_end), np.sqrt(nearest), noise, breadth):
         return
     if nearest < most and np.isnan(fit.noisy[0]):
         write_noise(around.length, kernel, fit)
     # Where no arrival is as near as the noise is large, the mean effect says where one arrives.
     if nearest >= most or fit.noisy[0] <= nearest:
-        weigh_ends(to, of_end, nearest, kernel.outcome_breadth, arrivals, end)
+        weigh_ends(to, of_end, nearest, breadth, arrivals, end)
         return
     total, ended, paid = 0.0, 0.0, 0.0
     for k in range(around.length):
@@ -133,7 +133,7 @@ def mean_end(fit, to, near, around, experience, kernel, end):
         for v in range(len(to)):
             square += fit.noise[k, v] * fit.noise[k, v]
             to[v] += fit.noise[k, v]
-        end_at(to, (np.sqrt(nearest) + np.sqrt(square)) ** 2, kernel.outcome_breadth, arrivals, ends, end)
+        end_at(to, (np.sqrt(nearest) + np.sqrt(square)) ** 2, breadth, arrivals, ends, end)
         for v in range(len(to)):
             to[v] -= fit.noise[k, v]
         weight = fit.weighted[0, k // GROUP, k % GROUP]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
-from sb3_combrel.common.observations import with_own_arrays
+from sb3_combrel.common.observations import last_observation, with_own_arrays
 from sb3_combrel.common.scaling import Bounds
 from sb3_combrel.sources.transitions import (
     AnyEnv,
@@ -89,7 +89,7 @@ def log_step(
         next_state = following[i]
         if done:
             # `following` is already the first state of the next episode.
-            last = info["terminal_observation"]
+            last = last_observation(info, seen[i])
             next_state = np.array(last if normalize is None else normalize.unnormalize_obs(last))
         terminated = bool(done) and not info.get("TimeLimit.truncated", False)
         log.add(states[i], int(actions[i]) - start, rewards[i], next_state, terminated)

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 Table: TypeAlias = "str | os.PathLike[str] | pd.DataFrame"
 ACTION, REWARD, TERMINATED, DONE, TRUNCATED, EPISODE = "action", "reward", "terminated", "done", "truncated", "episode"
 NEXT, INDEX = "next_", "Unnamed: "
+# What tables write where there is nothing; but an action may have such a name.
+_MISSING = ("", "NA", "N/A", "n/a", "NaN", "nan", "NULL", "null", "None", "<NA>")
 _NO_STATES = {ACTION, REWARD, TERMINATED, DONE, TRUNCATED, EPISODE}
 _TRUE, _FALSE = ("true", "1", "1.0"), ("false", "0", "0.0", "nan", "", "none", "<na>")
 _LIKE_ENDS = {"terminal", "terminated", "done", "last", "timeout", "time_out", "truncated", "end", "episode_end", "episode"}
@@ -38,7 +40,7 @@ def read_table(
     periodic: Sequence[bool] | None,
 ) -> Transitions:
     """Read the transitions of a table; for the parameters see :meth:`SourceInstances.from_table`."""
-    frame = _read(table)
+    frame = _read(table, action_names)
     if len(frame) == 0:
         raise ValueError(f"the table has no rows, its columns are {[str(name) for name in frame.columns]}")
     if EPISODE in frame.index.names:
@@ -68,7 +70,7 @@ def read_table(
     return Transitions.within(limits, columns, n_actions, given, origin)
 
 
-def _read(table: Table) -> pd.DataFrame:
+def _read(table: Table, action_names: Sequence[str]) -> pd.DataFrame:
     import pandas as pd
 
     if isinstance(table, pd.DataFrame):
@@ -76,10 +78,9 @@ def _read(table: Table) -> pd.DataFrame:
     if os.path.isdir(table):
         raise ValueError(f"table must be a CSV file or a pandas DataFrame, got the folder {os.fspath(table)}")
     try:
-        # "None" and "NA" may be names of actions.
-        frame = pd.read_csv(
-            table, skipinitialspace=True, keep_default_na=False, na_values=["", "nan", "NaN"], float_precision="round_trip"
-        )
+        missing = [word for word in _MISSING if word not in action_names]
+        exactly = {"skipinitialspace": True, "float_precision": "round_trip"}
+        frame = pd.read_csv(table, keep_default_na=False, na_values=missing, **exactly)
     except FileNotFoundError as error:
         raise FileNotFoundError(f"there is no file {os.fspath(table)}, looked for in {os.getcwd()}") from error
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:

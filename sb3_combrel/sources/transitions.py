@@ -12,7 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_combrel.common.attributes import attribute, list_of
+from sb3_combrel.common.attributes import attribute, names_of, periodic_of
 from sb3_combrel.common.checks import as_count
 from sb3_combrel.common.periodic import check_periods, flag_array
 from sb3_combrel.common.scaling import Bounds, Limits, StateScaling
@@ -146,9 +146,7 @@ def full_id(env: Any) -> Any:
 
 def task_names(env: AnyEnv) -> dict[str, tuple[Any, ...]]:
     """``state_names`` and ``action_names`` of a task, and which of its states are ``periodic``, as far as it says so."""
-    names = {name: list_of(env, name, str) for name in ("state_names", "action_names")}
-    flags = list_of(env, "periodic", bool, np.bool_)
-    found = {**names, "periodic": flags and [bool(flag) for flag in flags]}
+    found = {**names_of(env), "periodic": periodic_of(env) or ()}
     return {name: tuple(values) for name, values in found.items() if values}
 
 

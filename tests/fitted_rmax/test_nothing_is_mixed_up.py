@@ -347,6 +347,8 @@ def test_one_array_in_another_process_is_warned_of():
     try:
         with pytest.warns(UserWarning, match="the last observation of an episode equals the first of the next: .*copy"):
             small(env).learn(60)
+        with pytest.warns(UserWarning, match="the last observation of an episode equals the first of the next"):
+            SourceInstances.record(None, env, 100, 0)
     finally:
         env.close()
 

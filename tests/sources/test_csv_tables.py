@@ -276,6 +276,14 @@ def test_actions_may_have_names_that_pandas_takes_for_missing(name, tmp_path):
     np.testing.assert_array_equal(source.terminated, [False, False, True, False])
 
 
+@pytest.mark.parametrize("nothing", ["", "NA", "None", "nan", "NULL"])
+def test_what_is_no_name_of_an_action_is_missing(nothing, tmp_path):
+    (tmp_path / "log.csv").write_text(f"x,action,reward,terminated\n0,0,-1,0\n1,1,-1,1\n2,{nothing},{nothing},0\n")
+    source = SourceInstances.from_table(tmp_path / "log.csv")
+    np.testing.assert_array_equal(source.states.ravel(), [0.0, 1.0])
+    np.testing.assert_array_equal(source.terminated, [False, True])
+
+
 def test_numbers_come_back_from_a_file_to_the_last_digit(tmp_path):
     source = SourceInstances.record(None, "MountainCar-v0", 300, 0)
     source.to_table().to_csv(tmp_path / "log.csv", index=False)
