@@ -25,10 +25,11 @@ class Task:
     n_actions: int
     state_names: Sequence[str] = ()
     action_names: Sequence[str] = ()
-    bounds: StateScaling | None = None
+    bounds: StateScaling = None  # type: ignore[assignment]
     is_bounded: bool = True
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "bounds", self.bounds or self.scaling)
         for argument, n, letter in (("state_names", self.n_variables, "s"), ("action_names", self.n_actions, "a")):
             names = getattr(self, argument)
             is_list = isinstance(names, Sequence) and not isinstance(names, str)
@@ -42,8 +43,3 @@ class Task:
     def n_variables(self) -> int:
         """Number of state variables."""
         return self.scaling.n_variables
-
-    @property
-    def shared_scaling(self) -> StateScaling:
-        """Raw <-> the unit coordinates in which variables correspond to those of other tasks."""
-        return self.scaling if self.bounds is None else self.bounds

@@ -116,9 +116,9 @@ class FittedRMaxAgent:
     def _bind(self) -> None:
         """Tell the transfer method of the task, in the unit coordinates in which tasks correspond."""
         task, kernel = self.task, self.model_settings
-        self.correspondence = Correspondence(task.scaling, task.shared_scaling)
+        self.correspondence = Correspondence(task.scaling, task.bounds)
         target = TargetTask(
-            scaling=task.shared_scaling,
+            scaling=task.bounds,
             n_actions=task.n_actions,
             sample_states=self.correspondence.states(self.grid.points()),
             exploration_threshold=kernel.exploration_threshold,
@@ -463,7 +463,7 @@ class FittedRMaxAgent:
         errors = [abs(self.grid.interpolate(values, state) - self._q_values(state).max()) for state in states]
         if max(errors) > 0.0:
             lines = moved_lines(self.grid, np.array(states), np.array(errors))
-            self.rescale(self.task.scaling, self.task.shared_scaling, lines)
+            self.rescale(self.task.scaling, self.task.bounds, lines)
         self._lines_due = int(np.ceil(LINES_AGAIN * n))
 
     def _look_at_ends(self) -> None:
@@ -472,7 +472,7 @@ class FittedRMaxAgent:
             return
         evidence, is_so = evidence_for_action(self.model.transitions()), self.model_settings.ends_by_action
         if (-evidence if is_so else evidence) > SURE_OF_ENDS:
-            self.rescale(self.task.scaling, self.task.shared_scaling, ends_by_action=not is_so)
+            self.rescale(self.task.scaling, self.task.bounds, ends_by_action=not is_so)
         self._ends_due = 2 * self.rewards.n_ended
 
     def rescale(
@@ -501,7 +501,7 @@ class FittedRMaxAgent:
         before, model, lowest = self.task.scaling, self.model, self.planner.bounds[0]
         transitions = model.transitions()
         # What a transfer method has learned is about the bounds.
-        learned = self._method.get_state() if bounds == self.task.shared_scaling else {}
+        learned = self._method.get_state() if bounds == self.task.bounds else {}
         self.task, self.grid = replace(self.task, scaling=scaling, bounds=bounds), self.grid.with_lines(lines)
         self._bind()
         self._build(width=self.mdp.arrays.to.shape[2])
@@ -552,7 +552,7 @@ class FittedRMaxAgent:
         """Take over what :meth:`get_state` returned, in unit coordinates of ``scaling``, in place of what was learned."""
         with self.lock:
             generator = self.rng.bit_generator.state
-            self.task = self.task if scaling is None else replace(self.task, scaling=scaling, bounds=bounds)
+            self.task = self.task if scaling is None else replace(self.task, scaling=scaling, bounds=bounds or scaling)
             self.rewards.set_state(state["rewards"])
             self.grid, self._lines_due = self.grid.with_lines(state["lines"]), int(state["lines_due"][0])
             by_action, self._ends_due = bool(state["ends"][0] > 0.5), int(state["ends"][1])

@@ -133,7 +133,7 @@ class SavedAlgorithm(BaseAlgorithm):
             _check_same_transfer(model.policy.transfer, archive, path)
         agent, changed = model.policy.agent, _changed_settings(model, archive)
         if changed - OF_VALUES:
-            agent.rescale(agent.task.scaling, agent.task.shared_scaling)
+            agent.rescale(agent.task.scaling, agent.task.bounds)
         elif changed:
             agent.plan_anew()
         _check_room(model.policy.agent.model.instances.size, model)

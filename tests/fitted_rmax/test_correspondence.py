@@ -95,7 +95,7 @@ NARROW = StateScaling([-2.0, 0.0], [2.0, 2.0])
 def instances():
     """What transfers instances to a learner that has them, and the same for one with narrower scales."""
     model = learnt(TIMBREL(wide_source(), SAME, use="instances", breadth=0.01))
-    correspondence = Correspondence(NARROW, model.agent.task.shared_scaling)
+    correspondence = Correspondence(NARROW, model.agent.task.bounds)
     return model.transfer, OfLearner(model.transfer, correspondence)
 
 
@@ -164,7 +164,7 @@ def test_what_breaks_the_contract_is_refused_and_the_method_named(instances, mon
 )
 def test_what_was_learned_of_a_source_stays_when_the_learner_is_scaled_anew(make):
     model = learnt(make())
-    agent, transfer, bounds = model.agent, model.transfer, model.agent.task.shared_scaling
+    agent, transfer, bounds = model.agent, model.transfer, model.agent.task.bounds
     before, n_instances = transfer.get_state(), agent.model.n_instances
     agent.rescale(StateScaling([-2.0, 0.0], [2.0, 2.0]), bounds)
     assert agent.model.n_instances == n_instances

@@ -166,7 +166,7 @@ def test_what_is_transferred_stays_when_all_is_computed_anew(degree):
     transfer = TIMBREL(walk_source(), InterTaskMapping([0, 1], [0, 1]))
     agent = small(degree=degree, transfer=transfer).learn(40).agent
     before = agent.mdp.arrays.modelled & ~agent.model.known
-    agent.rescale(agent.task.scaling, agent.task.shared_scaling)
+    agent.rescale(agent.task.scaling, agent.task.bounds)
     after = agent.mdp.arrays.modelled & ~agent.model.known
     assert before.sum() > 100 and (after[before] | agent.model.known[before]).all()
 
@@ -178,7 +178,7 @@ def test_choices_of_grid_points_are_those_of_where_they_are_when_lines_have_move
         transition = naive.random_transition(rng, 2, 2)
         agent.update(transition.state, transition.action, -1.0, transition.next_state, False)
     method, lines = agent.transfer, np.abs(agent.grid.arrays.lines) ** 1.5
-    agent.rescale(agent.task.scaling, agent.task.shared_scaling, lines)
+    agent.rescale(agent.task.scaling, agent.task.bounds, lines)
     n_actions, points = agent.task.n_actions, method.task.sample_states
     for action, chosen in enumerate(method.choices().reshape(n_actions, -1)):
         at = method.selected(points, np.full(len(points), action))
@@ -205,7 +205,7 @@ def test_an_episode_that_an_expert_has_begun_goes_on_when_all_is_computed_anew()
     for environment in (0, 1):
         agent.act(states[environment], environment=environment)
     agent.update(states[0], 0, -1.0, states[0], False, 0)
-    agent.rescale(agent.task.scaling, agent.task.shared_scaling)
+    agent.rescale(agent.task.scaling, agent.task.bounds)
     agent.update(states[1], 1, -3.0, states[1], True, 1)
     agent.end_episode(False, 1)
     assert [each.total for each in agent.transfer._ended] == [-3.0]
@@ -294,7 +294,7 @@ def test_how_low_values_may_get_does_not_depend_on_how_often_all_is_computed_ane
     agent = small(max_value=-50.0, gamma=0.9).learn(40).agent
     bounds = agent.planner.bounds
     for _ in range(3):
-        agent.rescale(agent.task.scaling, agent.task.shared_scaling)
+        agent.rescale(agent.task.scaling, agent.task.bounds)
     assert agent.planner.bounds == bounds and bounds[0] < -50.0
 
 
@@ -360,6 +360,6 @@ def test_what_told_states_apart_stays_told_when_max_instances_has_removed_it():
         agent.update(state, k % 2, -1.0, np.clip(state + np.array([0.05, 0.0]), 0.0, 1.0), k == 20)
     known = agent.model.known.copy()
     assert len(agent.model.ends.state) == 0 and agent.rewards.n_ended == 1
-    agent.rescale(agent.task.scaling, agent.task.shared_scaling)
+    agent.rescale(agent.task.scaling, agent.task.bounds)
     np.testing.assert_array_equal(agent.model.known, agent.model.own_weight >= agent.model._threshold)
     assert agent.model.known.mean() > 0.99 * known.mean()

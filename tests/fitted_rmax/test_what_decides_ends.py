@@ -110,7 +110,7 @@ def test_an_interrupt_while_all_is_computed_anew_leaves_all_as_it_was(monkeypatc
     agent, due = model.agent, model.agent._ends_due
     monkeypatch.setattr(agent, "_build", lambda **_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
-        agent.rescale(agent.task.scaling, agent.task.shared_scaling, ends_by_action=True)
+        agent.rescale(agent.task.scaling, agent.task.bounds, ends_by_action=True)
     assert not by_action(model) and agent._ends_due == due
 
 
