@@ -76,3 +76,16 @@ def check_resolution(value: int | Sequence[int] | None, n_variables: int) -> Non
     for r in each:
         if isinstance(r, bool) or not isinstance(r, Integral) or not 1 <= int(r) <= 20:
             raise ValueError(f"resolution must be whole numbers from 1 to 20 (2**resolution cells), got {value!r}")
+
+
+def checked_names(argument: str, names: Sequence[str], n: int, letter: str) -> tuple[str, ...]:
+    """Names of ``n`` variables or actions; if none are given, the letter and a number.
+
+    :raises ValueError: unless there is one for each, all different
+    """
+    is_list = isinstance(names, Sequence | np.ndarray) and not isinstance(names, str)
+    if not is_list or len(names) not in (0, n):
+        raise ValueError(f"{argument} must hold {n} names or none, got {names!r}")
+    if len(set(names)) < len(names):
+        raise ValueError(f"{argument} must be different names, got {tuple(names)}")
+    return tuple(map(str, names)) if len(names) else tuple(f"{letter}{k}" for k in range(n))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from sb3_combrel.common.checks import checked_names
 from sb3_combrel.common.scaling import StateScaling
 
 
@@ -31,13 +32,7 @@ class Task:
     def __post_init__(self) -> None:
         object.__setattr__(self, "bounds", self.bounds or self.scaling)
         for argument, n, letter in (("state_names", self.n_variables, "s"), ("action_names", self.n_actions, "a")):
-            names = getattr(self, argument)
-            is_list = isinstance(names, Sequence) and not isinstance(names, str)
-            if not (is_list and len(names) in (0, n) and all(isinstance(name, str) for name in names)):
-                raise ValueError(f"{argument} must be {n} names or None, got {names!r}")
-            if len(set(names)) < len(names):
-                raise ValueError(f"{argument} must be different names, got {names!r}")
-            object.__setattr__(self, argument, tuple(names or (f"{letter}{k}" for k in range(n))))
+            object.__setattr__(self, argument, checked_names(argument, getattr(self, argument), n, letter))
 
     @property
     def n_variables(self) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,14 +44,3 @@ def terminal_flags(terminated: object, n: int) -> NDArray[np.bool_]:
     if array.shape != (n,) or array.dtype != np.bool_:
         raise ValueError(f"terminated must be booleans of shape ({n},), got {array.dtype} of shape {array.shape}")
     return array
-
-
-def checked_names(name: str, names: Sequence[str], n: int, letter: str) -> tuple[str, ...]:
-    """Names of ``n`` variables or actions; if none are given, the letter and a number."""
-    if not isinstance(names, Sequence | np.ndarray):
-        raise ValueError(f"{name} must be a sequence of names, got {names!r}")
-    if len(names) not in (0, n):
-        raise ValueError(f"{name} must hold {n} names, got {tuple(names)}")
-    if len(set(names)) < len(names):
-        raise ValueError(f"{name} must be different names, got {tuple(names)}")
-    return tuple(map(str, names)) if len(names) else tuple(f"{letter}{i}" for i in range(n))

@@ -16,7 +16,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_combrel.common.checks import as_count
+from sb3_combrel.common.checks import as_count, checked_names
 from sb3_combrel.common.files import write_whole
 from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.common.scaling import Bounds, StateScaling
@@ -24,7 +24,7 @@ from sb3_combrel.common.serialisation import register_reader, register_writer
 from sb3_combrel.common.user_warnings import warn_user
 from sb3_combrel.sources import minari_datasets, recording, replay_buffers, tables
 from sb3_combrel.sources.q_learning import learn_q_learning
-from sb3_combrel.sources.source_checks import action_array, checked_names, finite_array, terminal_flags
+from sb3_combrel.sources.source_checks import action_array, finite_array, terminal_flags
 from sb3_combrel.sources.subsets import check_method, covering_rows, random_rows
 from sb3_combrel.sources.transitions import LEARNERS, Floats, as_transition_count
 

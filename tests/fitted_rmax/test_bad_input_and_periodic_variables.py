@@ -153,8 +153,8 @@ def test_policies_of_other_kinds_are_refused(policy):
         ({3: 4}, "policy_kwargs must have names out of .*, got 3"),
         ({"gamma": 0.9}, r"policy_kwargs must not have 'gamma': pass gamma=\.\.\. to FittedRMax itself"),
         ({"model_class": FittedRMaxPolicy}, "model_class must be a subclass of Model or None"),
-        ({"state_names": 3}, "state_names must be"),
-        ({"action_names": ["one"]}, "action_names must be 2 names"),
+        ({"state_names": 3}, "state_names must hold"),
+        ({"action_names": ["one"]}, "action_names must hold 2 names"),
     ],
 )
 def test_wrong_policy_kwargs_are_refused_by_name(wrong, message):

@@ -157,7 +157,7 @@ def test_a_folder_is_no_file_of_instances(folder, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("names", [None, iter(["left", "right"]), 7])
 def test_names_that_are_no_sequence_are_refused_by_name(names):
-    with pytest.raises(ValueError, match="action_names must be a sequence of names"):
+    with pytest.raises(ValueError, match="action_names must hold"):
         dataclasses.replace(walk_source(), action_names=names)
 
 
