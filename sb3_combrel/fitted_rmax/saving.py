@@ -125,18 +125,19 @@ class SavedAlgorithm(BaseAlgorithm):
             kwargs["_generator_state"] = None
         with _naming(path, laid_out):
             archive = _read(path)
-            check_pickles(archive, custom_objects or ())
+            saved = _attributes_in(archive)
+            check_pickles(saved, custom_objects or ())
             model = super().load(
                 archive, environment, device, custom_objects, print_system_info, force_reset, **kwargs  # type: ignore[arg-type]
             )
         if "transfer" in kwargs:
-            _check_same_transfer(model.policy.transfer, archive, path)
-        agent, changed = model.policy.agent, _changed_settings(model, archive)
+            _check_same_transfer(model.policy.transfer, saved.get("transfer"), path)
+        agent, changed = model.policy.agent, _changed_settings(model, saved)
         if changed - OF_VALUES:
             agent.rescale(agent.task.scaling, agent.task.bounds)
         elif changed:
             agent.plan_anew()
-        _check_room(model.policy.agent.model.instances.size, model)
+        _check_room(int(agent.model.instances.size.max()), agent.settings.max_instances)
         return model if instances is None else cast(Any, model).load_instances(instances)
 
     def set_parameters(
@@ -177,22 +178,20 @@ class SavedAlgorithm(BaseAlgorithm):
         return ["policy"], []
 
 
-def _attributes_in(archive: io.BytesIO) -> dict[str, Any]:
-    """What Stable-Baselines3 has written of a model's attributes, as JSON has it."""
+def _attributes_in(archive: Any) -> dict[str, Any]:
+    """What Stable-Baselines3 has written of a model's attributes to an open file, or one of that name, as JSON has it."""
     with zipfile.ZipFile(archive) as content:
         return dict(json.loads(content.read("data")))
 
 
-def _changed_settings(model: Any, archive: io.BytesIO) -> set[str]:
+def _changed_settings(model: Any, saved: dict[str, Any]) -> set[str]:
     """The arguments that are others than those of the model that was saved, and on which what it has computed depends."""
-    saved = _attributes_in(archive)
     names = (name for name in FittedRMaxSettings.names() if name in saved and name not in OF_NOTHING)
     return {name for name in names if json.dumps(to_plain(getattr(model, name))) != json.dumps(saved[name])}
 
 
-def _check_same_transfer(transfer: Any, archive: io.BytesIO, path: object) -> None:
+def _check_same_transfer(transfer: Any, saved: Any, path: object) -> None:
     """:raises ValueError: if a method, once it is bound, is not the one that was saved, as far as that is described"""
-    saved = _attributes_in(archive).get("transfer")
     if not isinstance(saved, dict) or saved.get("arguments") is None:
         return
     if json.dumps(describe_transfer(transfer), sort_keys=True) != json.dumps(saved, sort_keys=True):
@@ -203,11 +202,11 @@ def _check_same_transfer(transfer: Any, archive: io.BytesIO, path: object) -> No
         )
 
 
-def _check_room(sizes: np.ndarray, model: Any) -> None:
-    """:raises ValueError: if a model has more instances of an action, of which there are ``sizes``, than it may keep"""
-    if model.max_instances is not None and sizes.max() > model.max_instances:
+def _check_room(most: int, max_instances: int | None) -> None:
+    """:raises ValueError: if a model has more instances of an action, at ``most``, than it may keep"""
+    if max_instances is not None and most > max_instances:
         raise ValueError(
-            f"max_instances must be at least {sizes.max()}, as many as the model has of one action, got {model.max_instances}"
+            f"max_instances must be at least {most}, as many as the model has of one action, got {max_instances}"
             "; or make a new model with them: FittedRMax(env, instances=..., max_instances=...)"
         )
 
@@ -265,9 +264,8 @@ def _origin(path: object) -> tuple[str, str]:
     if isinstance(path, str | Path) and not Path(path).exists():
         path = f"{path}.zip"
     try:
-        with zipfile.ZipFile(path) as archive:  # type: ignore[call-overload]
-            data = json.loads(archive.read("data"))
-            return data.get("package_version", BEFORE), data.get("policy_class", {}).get("__module__", "")
+        data = _attributes_in(path)
+        return data.get("package_version", BEFORE), data.get("policy_class", {}).get("__module__", "")
     except Exception:
         # Damaged content makes libraries raise anything.
         return "", ""

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import base64
 import io
-import json
 import pickle
 import sys
-import zipfile
-from collections.abc import Container
+from collections.abc import Container, Mapping
 from typing import Any
 
 from gymnasium.spaces import Space
@@ -32,17 +30,14 @@ NAMES = {
 KINDS = BasePolicy, Model, Space
 
 
-def check_pickles(archive: io.BytesIO, custom_objects: Container[str]) -> None:
+def check_pickles(attributes: Mapping[str, Any], custom_objects: Container[str]) -> None:
     """Read what is pickled in a model's file without running anything but what spaces, arrays and buffers need.
 
-    :param archive: the file of a model; read from its beginning, and left there
+    :param attributes: what the file has of each, as JSON has it
     :param custom_objects: names that are not read, as they are replaced
     :raises ValueError: if a pickle asks for something else
     """
-    with zipfile.ZipFile(archive) as file:
-        data = json.loads(file.read("data"))
-    archive.seek(0)
-    for name, value in data.items():
+    for name, value in attributes.items():
         if isinstance(value, dict) and SERIALIZED in value and name not in custom_objects:
             try:
                 _Careful(io.BytesIO(base64.b64decode(value[SERIALIZED]))).load()
