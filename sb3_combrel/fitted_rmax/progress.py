@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from itertools import accumulate
 
 import numpy as np
+from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_combrel.common.user_warnings import warn_user
 from sb3_combrel.fitted_rmax.optimism import RewardRange
-from sb3_combrel.fitted_rmax.vec_envs import has_time_limit
 
 # So many episodes in a row are no coincidence.
 IDLE_EPISODES = 3
@@ -37,8 +37,9 @@ class ProgressWatch:
         self.rewards, self.tolerance = rewards, float(tolerance)
         self._n_idle = self._n_equal = self._n_optimistic = 0
         self._last_return: float | None = None
-        self._first_return, self._all_alike, self._has_explored = np.nan, True, False
-        self._largest, self._n_episodes, self._n_steps = 0.0, 0, 0
+        # Of the first episodes: discounted returns, whether actions were tried in any, and the largest reward in size.
+        self._values: list[float] = []
+        self._has_explored, self._largest, self._n_steps = False, 0.0, 0
         self._warned: set[str] = set()
 
     def note(self, rewards: Sequence[float], terminated: bool, n_optimistic_actions: int) -> None:
@@ -52,10 +53,10 @@ class ProgressWatch:
             self._note_best_return(rewards)
         self._note_cost(rewards, terminated)
         self._note_endless()
-        self._note_size(rewards)
         explored, self._n_optimistic = n_optimistic_actions > self._n_optimistic, n_optimistic_actions
         self._note_return(rewards, terminated, explored)
-        self._note_all(rewards, explored)
+        if len(self._values) < EQUAL_RETURNS:
+            self._note_first(rewards, explored)
 
     def note_step(self, env: VecEnv) -> None:
         """Look at the number of steps; ``env`` is the environment in which they are made."""
@@ -63,7 +64,7 @@ class ProgressWatch:
         if self._n_steps != MANY_STEPS:
             return
         seen = self.rewards
-        if seen.gamma == 1.0 and seen.n_ended == seen.n_truncated == 0 and not has_time_limit(env):
+        if seen.gamma == 1.0 and seen.n_ended == seen.n_truncated == 0 and not any(env.env_is_wrapped(TimeLimit)):
             self._warn(
                 "endless",
                 f"gamma=1, and after {MANY_STEPS} steps no episode has ended: if the task has no end, plans never settle; "
@@ -111,16 +112,6 @@ class ProgressWatch:
                 "returns grow without limit, and plans never settle; leave gamma out, or pass gamma=0.99",
             )
 
-    def _note_size(self, rewards: Sequence[float]) -> None:
-        self._largest = max(self._largest, *map(abs, rewards))
-        self._n_episodes += 1
-        if self._n_episodes == EQUAL_RETURNS and 0.0 < self._largest <= self.tolerance:
-            self._warn(
-                "tiny",
-                f"no reward so far is larger than {self._largest:g}, and plans are good to planning_tolerance="
-                f"{self.tolerance:g}: pass planning_tolerance={self.tolerance * self._largest:.2g}, or larger rewards",
-            )
-
     def _note_return(self, rewards: Sequence[float], terminated: bool, explored: bool) -> None:
         total, gamma, max_value = sum(rewards), self.rewards.gamma, self.rewards.max_value
         # Where rewards are collected until the time limit it is a success to reach it.
@@ -137,21 +128,26 @@ class ProgressWatch:
                 "longer time limit, exploration gets farther",
             )
 
-    def _note_all(self, rewards: Sequence[float], explored: bool) -> None:
-        if self._n_episodes > EQUAL_RETURNS or not self._all_alike:
+    def _note_first(self, rewards: Sequence[float], explored: bool) -> None:
+        gamma = self.rewards.gamma
+        self._values.append(_discounted(rewards, gamma)[-1])
+        self._has_explored = self._has_explored or explored
+        self._largest = max(self._largest, *map(abs, rewards))
+        if len(self._values) < EQUAL_RETURNS:
             return
-        value = _discounted(rewards, self.rewards.gamma)[-1]
-        if self._n_episodes == 1:
-            self._first_return = value
-        self._all_alike, self._has_explored = value == self._first_return, self._has_explored or explored
-        if self._n_episodes == EQUAL_RETURNS and self._all_alike and self._has_explored and "equal" not in self._warned:
-            gamma = self.rewards.gamma
+        if 0.0 < self._largest <= self.tolerance:
+            self._warn(
+                "tiny",
+                f"no reward so far is larger than {self._largest:g}, and plans are good to planning_tolerance="
+                f"{self.tolerance:g}: pass planning_tolerance={self.tolerance * self._largest:.2g}, or larger rewards",
+            )
+        if len(set(self._values)) == 1 and self._has_explored and "equal" not in self._warned:
             sooner = "; with gamma=1 it does not matter how soon an end pays, as it does with gamma=0.99"
             self._warn(
                 "alike",
-                f"all {EQUAL_RETURNS} episodes so far have the same return, {value:g} (discounted with gamma={gamma:g}), "
-                "though the agent has tried other actions: nothing that it did has made a difference. Unless something is yet "
-                f"to be found, look at the task's rewards and ends{sooner if gamma == 1.0 else ''}",
+                f"all {EQUAL_RETURNS} episodes so far have the same return, {self._values[0]:g} (discounted with "
+                f"gamma={gamma:g}), though the agent has tried other actions: nothing that it did has made a difference. "
+                f"Unless something is yet to be found, look at the task's rewards and ends{sooner if gamma == 1.0 else ''}",
             )
 
     def _warn(self, of: str, message: str) -> None:

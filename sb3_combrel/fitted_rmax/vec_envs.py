@@ -38,11 +38,6 @@ def warn_of_shared(env: VecEnv, callback: BaseCallback) -> None:
         )
 
 
-def has_time_limit(env: VecEnv) -> bool:
-    """Whether Gymnasium's wrapper limits the length of episodes."""
-    return any(env.env_is_wrapped(gym.wrappers.TimeLimit))
-
-
 def refuse_running_means(env: VecEnv) -> None:
     """:raises ValueError: if observations, or rewards but by ``VecNormalize``, are normalized by means that run"""
     normalizer = unwrap_vec_normalize(env)
