@@ -118,7 +118,7 @@ class SavedAlgorithm(BaseAlgorithm):
         :raises ValueError: if the file is damaged, was not saved by this class, or does not fit the other arguments
         """
         check_argument_names(cls, kwargs)
-        environment = maybe_make_env(full_id(env), verbose=0) if isinstance(env, str) else env
+        environment = maybe_make_env(full_id(env), verbose=0)
         instances = kwargs.pop("instances", None)
         laid_out = sorted(kwargs.keys() & NOT_TO_CHANGE)
         if "seed" in kwargs:
