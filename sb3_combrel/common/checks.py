@@ -86,6 +86,7 @@ def checked_names(argument: str, names: Sequence[str], n: int, letter: str) -> t
     is_list = isinstance(names, Sequence | np.ndarray) and not isinstance(names, str)
     if not is_list or len(names) not in (0, n):
         raise ValueError(f"{argument} must hold {n} names or none, got {names!r}")
-    if len(set(names)) < len(names):
-        raise ValueError(f"{argument} must be different names, got {tuple(names)}")
-    return tuple(map(str, names)) if len(names) else tuple(f"{letter}{k}" for k in range(n))
+    texts = tuple(map(str, names)) if len(names) else tuple(f"{letter}{k}" for k in range(n))
+    if len(set(texts)) < n:
+        raise ValueError(f"{argument} must be different names, got {texts}")
+    return texts
