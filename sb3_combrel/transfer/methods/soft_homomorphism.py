@@ -97,7 +97,7 @@ class SoftHomomorphism(Transfer):
         shape = copies, source.n_variables, 1 + int(self._readings.number.max())
         self._shape = Logits(np.zeros(shape), np.zeros((copies, task.n_actions, source.n_actions)))
         self._logits: Logits | None = None
-        self._mixture = soft.MixturePredictions(model, self._readings, mean, task.sample_states)
+        self._mixture = soft.MixturePredictions(model, self._readings, mean)
         self._transitions = RecordedTransitions(d)
         self._evidence = PriorEvidence(task.n_actions, d, float(np.abs(source.rewards).max()))
         self._own: OwnPrediction | None = None

@@ -10,12 +10,11 @@ import numpy as np
 import torch as th
 
 from sb3_combrel.transfer.prior.copies import Predicted, distinct_rows
-from sb3_combrel.transfer.source_model import SourceModel, SourcePredictions
+from sb3_combrel.transfer.source_model import SourceModel
 
 LOGIT_DEVIATION = 3.0  # logits have a normal prior of this standard deviation: a few transitions do not make anything certain
 N_STEPS, STEP_SIZE = 200, 0.1
 NOTHING = -1
-MAX_STORED = 128  # predictions of the sample are stored for so many mappings with a source action
 BATCH = 4096  # pairs that are predicted at once
 
 
@@ -151,9 +150,8 @@ class MixturePredictions:
 
     terms: Terms
 
-    def __init__(self, model: SourceModel, readings: Readings, mean: np.ndarray, sample: np.ndarray):
-        self.model, self.readings, self.mean, self.sample = model, readings, mean, sample
-        self._stored: dict[tuple[int, int], tuple[np.ndarray, SourcePredictions]] = {}
+    def __init__(self, model: SourceModel, readings: Readings, mean: np.ndarray):
+        self.model, self.readings, self.mean = model, readings, mean
 
     def set_terms(self, terms: Terms) -> None:
         """Use this mixture from now on."""
@@ -163,8 +161,6 @@ class MixturePredictions:
     def predict(self, states: np.ndarray, actions: np.ndarray) -> Predicted:
         """Return effects, shape (n, n_target_variables); rewards and weights, shape (n,)."""
         n, d = states.shape
-        if n == len(self.sample) and n > 1 and (actions == actions[0]).all() and np.array_equal(states, self.sample):
-            return self._predict_sample(int(actions[0]))
         found = np.zeros((n, d)), np.zeros(n), np.zeros(n)
         for first in range(0, n, BATCH):
             rows = slice(first, first + BATCH)
@@ -189,33 +185,12 @@ class MixturePredictions:
         row = np.repeat(np.arange(n), count)
         term = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(terms.first[actions], count)
         mapping, share, place = terms.mapping[term], terms.share[term], row * self.n_copies + terms.copy[term]
-        predicted = self.model.predict(to_source(states[row], self.readings, mapping, self.mean), terms.action[term])
-        effects = share[:, None] * to_target(predicted.effect, self.readings, mapping, d)
+        at, action = to_source(states[row], self.readings, mapping, self.mean), terms.action[term]
+        # Many states of the target are one state of the source, which is predicted once.
+        chosen, kind = distinct_rows(np.column_stack([at, action]))
+        predicted = self.model.predict(at[chosen], action[chosen])
+        effects = share[:, None] * to_target(predicted.effect[kind], self.readings, mapping, d)
         effect = np.column_stack([np.bincount(row, effects[:, v], n) for v in range(d)])
-        size = n * self.n_copies
-        outcomes = predicted.reward, predicted.weight
-        each = [np.bincount(place, share * of_terms, size).reshape(n, self.n_copies) for of_terms in outcomes]
-        return effect, each[0].mean(axis=1), each[1].min(axis=1)
-
-    def _predict_sample(self, action: int) -> Predicted:
-        """Predict the whole sample, one term after the other; different states of the source once."""
-        terms, (n, d) = self.terms, self.sample.shape
-        effect, each = np.zeros((n, d)), np.zeros((2, n, self.n_copies))
-        for t in range(terms.first[action], terms.first[action + 1]):
-            mapping = int(terms.mapping[t])
-            kind, predicted = self._of_sample(mapping, int(terms.action[t]))
-            effect += terms.share[t] * to_target(predicted.effect, self.readings, mapping, d)[kind]
-            for sums, of_kinds in zip(each, (predicted.reward, predicted.weight), strict=True):
-                sums[:, terms.copy[t]] += terms.share[t] * of_kinds[kind]
-        return effect, each[0].mean(axis=1), each[1].min(axis=1)
-
-    def _of_sample(self, mapping: int, action: int) -> tuple[np.ndarray, SourcePredictions]:
-        """The number of each state's prediction, int32, shape (n_points,), and the predictions."""
-        if (mapping, action) not in self._stored:
-            at = to_source(self.sample, self.readings, mapping, self.mean)
-            chosen, kind = distinct_rows(at)
-            predicted = self.model.predict(at[chosen], np.full(len(chosen), action, dtype=np.int64))
-            if len(self._stored) >= MAX_STORED:
-                del self._stored[next(iter(self._stored))]
-            self._stored[mapping, action] = kind.astype(np.int32), predicted
-        return self._stored[mapping, action]
+        outcomes = predicted.reward[kind], predicted.weight[kind]
+        reward, weight = (np.bincount(place, share * each, n * self.n_copies).reshape(n, -1) for each in outcomes)
+        return effect, reward.mean(axis=1), weight.min(axis=1)
