@@ -170,9 +170,6 @@ def test_first_the_agent_then_each_expert_then_the_best():
         assert arm == expected
         returns[arm].append(sum([total]))
     assert len(returns[1]) > 30 and all(len(of_one) >= 2 for of_one in returns)
-    names = [name for name, *_ in method.describe()]
-    assert names[0] == "agent" and names[1].startswith("InterTaskMapping(s0<-s0, s1<-s1; a0<-a0")
-    assert [n for *_, n in method.describe()] == list(map(len, returns))
     later = returns[0][len(returns[0]) // 2 :]
     np.testing.assert_allclose(method.mean_returns(), [np.mean(later), *map(np.mean, returns[1:])])
     assert method.statistics()["transfer/best_expert"] == 1
@@ -216,7 +213,7 @@ def test_returns_are_those_of_the_episodes_of_each_environment_and_the_agent_lea
     np.testing.assert_allclose([each.total for each in method._ended], [info["r"] for info in model.ep_info_buffer], atol=1e-5)
     assert sum(each.steps for each in method._ended) == sum(info["l"] for info in model.ep_info_buffer)
     assert model.agent.model.n_instances == 300
-    assert len(method.experts) == 8 and all(n > 0 for *_, n in method.describe())
+    assert len(method.experts) == 8 and {each.arm for each in method._ended} == set(range(9))
     assert model.agent.model.transfer is None
 
 

@@ -85,12 +85,6 @@ def test_every_mapping_to_every_source_is_a_task():
     expected = naive_candidate_compliances(sources, sets, transitions)
     found = candidate_compliances(method.candidates, method._tasks.sums, 20)
     assert {key_of(method, candidate): pytest.approx(each, rel=1e-9) for candidate, each in enumerate(found)} == expected
-    for number, mappings in enumerate(sets):
-        for mapping in list(mappings)[::7]:
-            expected = eq_6(transitions, sources[number], mapping)
-            assert method.task_compliance(mapping, number) == pytest.approx(expected, rel=1e-9)
-    with pytest.raises(ValueError, match="mapping must have a state mapping of the set of source 0, got"):
-        method.task_compliance(InterTaskMapping([0, None, None], [0, 0]))
     # What all candidates of an action have together is the mean compliance of all tasks.
     first = method.candidates.arrays.first
     totals = [found[begin:end].sum() for begin, end in itertools.pairwise(first)]

@@ -194,12 +194,6 @@ class MappingExperts(Transfer):
     def _returns(self) -> list[list[float]]:
         return [[each.total for each in self._ended if each.arm == k] for k in range(1 + len(self.experts))]
 
-    def describe(self) -> list[tuple[str, float, int]]:
-        """Return the name, the mean return and the number of episodes of all who may act, the agent first."""
-        names = ["agent", *(repr(mapping) for _, mapping in self.experts)]
-        numbers = map(len, self._returns())
-        return list(zip(names, self.mean_returns().tolist(), numbers, strict=True))
-
     def _best(self) -> int:
         means = self.mean_returns()
         return AGENT if np.isnan(means).all() else int(np.nanargmax(means))

@@ -8,7 +8,6 @@ import numpy as np
 
 from sb3_combrel.common.checks import check_count
 from sb3_combrel.common.instances import Instances
-from sb3_combrel.mappings.inter_task_mapping import InterTaskMapping
 from sb3_combrel.mappings.mapping_set import MappingSet
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.candidates import Candidates, MappingsLike
@@ -125,22 +124,6 @@ class SampleTransfer(MappingTransfer):
         candidates = self.candidates.with_own(instances_of_each(self.candidates, drawn))
         instances = self._instances
         instances.translator = self._make_translator(candidates, instances.translator.rules.breadth)
-
-    def task_compliance(self, mapping: InterTaskMapping, source: int = 0) -> float:
-        """Return the compliance, 0 to 1, of a mapping's virtual source task with the transitions so far, Lambda_X of Eq. 6.
-
-        :return: 0 before the first transition
-        :raises ValueError: if the set has no such state mapping
-        """
-        mappings = self.candidates.sets[source]
-        same = (mappings.state_mappings == mapping.state_index) & (mappings.state_signs == mapping.state_sign)
-        rows = np.flatnonzero(same.all(axis=1))
-        if len(rows) == 0:
-            raise ValueError(f"mapping must have a state mapping of the set of source {source}, got {mapping!r}")
-        row = int(rows[0]) + self.candidates.first_row[source]
-        actions = np.array(mapping.action) + self.candidates.first_action[source]
-        sums = self._tasks.sums[row, np.arange(len(actions)), actions]
-        return float(sums.sum() / max(self._tasks.transitions.n, 1))
 
     def mapping_steps(self) -> int:
         """Return after how many transitions of the target instances were first drawn; all so far if none have been."""

@@ -186,23 +186,6 @@ class SoftHomomorphism(Transfer):
                 found[:, int(self._readings.sign[m, k] < 0.0), k, v] += of_mapping[:, m]
         return found, of_action
 
-    def describe(self) -> str:
-        """Say what each target action is most probably taken for, mapping and action: "East: Right on (x, vx) 0.97, ..."."""
-        if self._logits is None:
-            return "; ".join(f"{name}: nothing" for name in self._bound_task.action_names)
-        of_mapping, of_action = soft.probabilities(self._logits, self._readings)
-        words = []
-        for a, target_action in enumerate(self._bound_task.action_names):
-            of_copies = []
-            for copy, actions in zip(of_mapping, of_action[:, a], strict=True):
-                joint = np.outer(copy, actions)
-                m, b = np.unravel_index(joint.argmax(), joint.shape)
-                read = zip(self._readings.variable[m].tolist(), self._readings.sign[m].tolist(), strict=True)
-                names = ["nothing" if v < 0 else ("-" if s < 0 else "") + self._bound_task.state_names[v] for v, s in read]
-                of_copies.append(f"{self._source.action_names[b]} on ({', '.join(names)}) {joint.max():.2f}")
-            words.append(f"{target_action}: {', '.join(of_copies)}")
-        return "; ".join(words)
-
     def statistics(self) -> dict[str, float]:
         wrong, baseline = self._squares.tolist()
         of_mapping = soft.probabilities(self._logits, self._readings)[0] if self._logits else np.full((1, 1), np.nan)
