@@ -57,46 +57,6 @@ class TileCoding:
         return self._first + (inside + self._offsets).astype(np.int64) @ self._strides
 
 
-class _Traces:
-    """Replacing eligibility traces of the tiles that have been visited, of all actions; the other tiles' are 0."""
-
-    def __init__(self, n_features: int, n_actions: int) -> None:
-        # Where each tile's traces are; and, with room for more, which tiles they are of and what they are.
-        self._place = np.full(n_features, -1, dtype=np.int64)
-        self._tiles, self._values = np.empty(0, dtype=np.int64), np.empty((0, n_actions))
-        self._n = 0
-
-    @property
-    def tiles(self) -> NDArray[np.int64]:
-        """The tiles that have been visited, shape (n,)."""
-        return self._tiles[: self._n]
-
-    @property
-    def values(self) -> NDArray[np.float64]:
-        """Their traces, shape (n, n_actions)."""
-        return self._values[: self._n]
-
-    def cut(self) -> None:
-        """Make all traces 0."""
-        self._place[self.tiles] = -1
-        self._n = 0
-
-    def renew(self, tiles: NDArray[np.int64], action: int, decay: float) -> None:
-        """Let the traces decay, and make those of tiles 1 for an action, 0 for the others."""
-        self._values[: self._n] *= decay
-        new = tiles[self._place[tiles] < 0]
-        while len(self._tiles) < self._n + len(new):
-            room = max(64, len(self._tiles))
-            self._tiles = np.append(self._tiles, np.empty(room, dtype=np.int64))
-            self._values = np.vstack([self._values, np.empty((room, self._values.shape[1]))])
-        self._place[new] = np.arange(self._n, self._n + len(new))
-        self._tiles[self._n : self._n + len(new)] = new
-        self._n += len(new)
-        at = self._place[tiles]
-        self._values[at] = 0.0
-        self._values[at, action] = 1.0
-
-
 class QLearning:
     """Watkins's Q(lambda) on tile-coded states: one-step Q-learning with eligibility traces that a random action cuts.
 
@@ -166,14 +126,15 @@ class QLearning:
         state, _ = self.env.reset(seed=seed)
         check_observation(state, f"at the reset before episode {len(self.episode_lengths) + 1}")
         tiles = self._tiles(state)
-        traces = _Traces(*self.weights.shape)
+        # Replacing traces of all tiles and actions; all but those of the tiles visited are 0.
+        traces, visited = np.zeros(self.weights.shape), np.empty(0, dtype=np.int64)
         for step in range(1, max_steps + 1):
             values = self._values(tiles)
             greedy = self._argmax(values)
             action = int(self._rng.integers(self.n_actions)) if (self._rng.random() < self.epsilon) else greedy
             if values[action] < values[greedy]:
                 # What follows an exploratory action is no evidence on the greedy policy from the states before it.
-                traces.cut()
+                traces[visited], visited = 0.0, visited[:0]
             following, given, terminated, truncated, _ = self.env.step(action + self._first_action)
             when = f"in step {step} of episode {len(self.episode_lengths) + 1}"
             check_observation(following, when)
@@ -185,8 +146,10 @@ class QLearning:
             error = reward + self.gamma * best - values[action]
             if not math.isfinite(error):
                 raise ValueError(f"the Q-values overflow {when}, at the reward {reward:g}: scale the rewards down")
-            traces.renew(tiles, action, self.gamma * self.trace_decay)
-            self.weights[traces.tiles] += (self.learning_rate / self.coding.n_tilings * error) * traces.values
+            traces[visited] *= self.gamma * self.trace_decay
+            traces[tiles], traces[tiles, action] = 0.0, 1.0
+            visited = np.union1d(visited, tiles)
+            self.weights[visited] += (self.learning_rate / self.coding.n_tilings * error) * traces[visited]
             state, tiles = following, next_tiles
             if terminated or truncated:
                 self.episode_lengths.append(step)
