@@ -6,7 +6,6 @@ import os
 import reprlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -73,25 +72,6 @@ class PastData(SavedAlgorithm):
             *(scaling.to_raw(states), actions, rewards, scaling.to_raw(next_states), terminated, scaling.low, scaling.high),
             *(task.n_actions, tuple(task.state_names), tuple(task.action_names), origin, tuple(map(bool, agent.periodic))),
         )
-
-    def save_replay_buffer(self, path: str | Path) -> None:
-        """Write the experience to a file, as :class:`~sb3_combrel.SourceInstances`: data alone, no pickled objects.
-
-        A saved model has its experience already. This file is for another model, or a source for another task.
-
-        :param path: of the file; .npz is added if it has no suffix
-        :raises ValueError: if there is no experience
-        """
-        self.source_instances().save(path)
-
-    def load_replay_buffer(self, path: str | Path, truncate_last_traj: bool = True) -> None:
-        """Take in what :meth:`save_replay_buffer` has written, which is :meth:`load_instances` of a file.
-
-        :param path: of the file
-        :param truncate_last_traj: not used; every transition stands for itself
-        :raises FileNotFoundError: if there is no such file; ValueError: as :meth:`load_instances`
-        """
-        self.load_instances(path)
 
     def _read_instances(self, given: Any, n_instances: int) -> SourceInstances:
         task = self.policy.agent.task

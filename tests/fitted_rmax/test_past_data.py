@@ -122,11 +122,10 @@ def test_a_replay_buffer_is_read_transition_by_transition():
         assert limits.any() and not found.terminated[limits].any(), "a time limit is no end"
 
 
-def test_an_own_replay_buffer_is_written_and_read(tmp_path):
+def test_own_experience_is_written_and_read(tmp_path):
     first = model().learn(60)
-    first.save_replay_buffer(tmp_path / "buffer")
-    second = model()
-    second.load_replay_buffer(tmp_path / "buffer.npz")
+    first.source_instances().save(tmp_path / "experience.npz")
+    second = model().load_instances(tmp_path / "experience.npz")
     np.testing.assert_allclose(second.source_instances().states, first.source_instances().states, atol=1e-12)
     np.testing.assert_array_equal(second.source_instances().terminated, first.source_instances().terminated)
 
@@ -355,9 +354,9 @@ def test_what_is_no_file_of_past_data_is_named(tmp_path):
         model().load_instances(tmp_path / "dqn.zip")
 
 
-def test_without_experience_there_is_nothing_to_write(tmp_path):
+def test_without_experience_there_is_nothing_to_write():
     with pytest.raises(ValueError, match="no experience yet"):
-        model().save_replay_buffer(tmp_path / "buffer")
+        model().source_instances()
 
 
 def test_a_buffer_that_forgets_where_episodes_ended_is_refused():

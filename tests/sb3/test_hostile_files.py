@@ -117,7 +117,6 @@ def readers(path):
     yield lambda: learner.set_parameters(path)
     yield lambda: SourceInstances.load(path)
     yield lambda: learner.load_instances(path)
-    yield lambda: learner.load_replay_buffer(path)
     yield lambda: FittedRMax(Walk(), transfer=COMBREL(str(path)))
 
 

@@ -172,7 +172,7 @@ def test_runs_shorter_than_the_window_are_named(tmp_path, capsys):
 def logs(tmp_path_factory):
     """What a training run has left: last and best model, checkpoints and evaluations."""
     folder = tmp_path_factory.mktemp("logs")
-    assert call("train", *train_args(folder, "--save-freq", 200)) == 0
+    assert call("train", *train_args(folder, "--save-freq", 200, "--save-replay-buffer")) == 0
     return folder
 
 
@@ -189,6 +189,8 @@ class TestChain:
         ):
             assert enjoy(logs, *which) == 0 and file in capsys.readouterr().out
         assert call("train", *train_args(tmp_path, "-i", folder / f"{IN_LOGS}.zip", n=100)) == 0
+        (resumed,) = tmp_path.glob(f"fitted_rmax/*/{IN_LOGS}.zip")
+        assert FittedRMax.load(resumed).agent.model.n_instances == 700, "none is counted twice"
         options = ("-n", 5, "-o", tmp_path, "-f", logs, "--gym-packages", "combrel_envs")
         assert call("record_video", "--algo", "fitted_rmax", "--env", CAR, *options) == 0
         assert list(tmp_path.glob("*.mp4"))
