@@ -1,4 +1,4 @@
-"""Sequences of action mappings, looked up by number: which source action each target action is mapped to."""
+"""Sequences of action mappings: which source action each target action is mapped to."""
 
 from __future__ import annotations
 
@@ -37,18 +37,6 @@ class ActionMappings(ABC):
     def __getitem__(self, index: int) -> tuple[int, ...]:
         """The action mapping of that number, from 0 to ``n_mappings - 1``."""
 
-    def first(self, action: int, source_action: int) -> int:
-        """Number of the first of them; ``ValueError`` if there is none."""
-        if source_action not in self.source_actions_for(action):
-            raise ValueError(
-                f"no mapping of the set maps target action {action} to source action {source_action}; "
-                f"the possible source actions are {self.source_actions_for(action).tolist()}"
-            )
-        return self._first(action, source_action)
-
-    @abstractmethod
-    def _first(self, action: int, source_action: int) -> int: ...
-
     def source_actions_for(self, action: int) -> Ints:
         """The source actions that target action ``action`` is mapped to by some mapping, ascending; unless overridden, all."""
         return np.arange(self.n_source_actions, dtype=np.int64)
@@ -78,9 +66,6 @@ class AllActionMappings(ActionMappings):
         n = self.n_source_actions
         return tuple(index // n**place % n for place in reversed(range(self.n_target_actions)))
 
-    def _first(self, action: int, source_action: int) -> int:
-        return source_action * self.n_source_actions ** (self.n_target_actions - 1 - action)
-
 
 @dataclass(frozen=True)
 class BalancedActionMappings(ActionMappings):
@@ -109,20 +94,6 @@ class BalancedActionMappings(ActionMappings):
                     break
                 index -= following
         return tuple(chosen)
-
-    def _first(self, action: int, source_action: int) -> int:
-        # The first such mapping has at each position the first choice that leaves a `source_action` for position `action`.
-        chosen: list[int] = []
-        number = 0
-        for position in range(action + 1):
-            for candidate in range(self.n_source_actions):
-                # What is left to be chosen may come in any order, so `source_action` may as well come next.
-                reserved = [candidate, source_action] if position < action else [candidate]
-                if self._completions([*chosen, *reserved]) and (position < action or candidate == source_action):
-                    chosen.append(candidate)
-                    break
-                number += self._completions([*chosen, candidate])
-        return number
 
     def _completions(self, chosen: Sequence[int]) -> int:
         """Number of balanced mappings that begin with ``chosen``."""
@@ -172,9 +143,6 @@ class ListedActionMappings(ActionMappings):
     def __getitem__(self, index: int) -> tuple[int, ...]:
         self._check_index(index)
         return tuple(self.mappings[index].tolist())
-
-    def _first(self, action: int, source_action: int) -> int:
-        return int((self.mappings[:, action] == source_action).argmax())
 
     def source_actions_for(self, action: int) -> Ints:
         return np.unique(self.mappings[:, action])

@@ -216,14 +216,15 @@ class InterTaskMapping:
         if self.names is None:
             mirrored = f", sign={self.sign}" if -1 in self.state_sign else ""
             return f"InterTaskMapping(state={self.state}, action={self.action}{mirrored})"
-        source_variables, target_variables, source_actions, target_actions = self.names
-        variables = [
-            f"{name}<-{source_variables[source]}" if sign > 0 else f"{name}<-(-{source_variables[source]})"
-            for name, source, sign in zip(target_variables, self.state, self.state_sign, strict=True)
-            if source is not None
-        ]
-        actions = [f"{name}<-{source_actions[source]}" for name, source in zip(target_actions, self.action, strict=True)]
-        return f"InterTaskMapping({', '.join(variables)}; {', '.join(actions)})"
+        pairs = zip(self.names.target_actions, self.action, strict=True)
+        actions = [f"{name}<-{self.names.source_actions[source]}" for name, source in pairs]
+        return f"InterTaskMapping({self.variables_by_name()}; {', '.join(actions)})"
+
+    def variables_by_name(self) -> str:
+        """The pairs of variables of a mapping that has both tasks' names: "x<-x, vx<-(-v)"."""
+        assert self.names is not None
+        source, pairs = self.names.source_variables, zip(self.names.target_variables, self.state, self.state_sign, strict=True)
+        return ", ".join(f"{v}<-{source[k]}" if sign > 0 else f"{v}<-(-{source[k]})" for v, k, sign in pairs if k is not None)
 
     def _source_columns(self, name: str, values: ArrayLike) -> Floats:
         """The source column of each target variable; unmapped ones get an arbitrary column, to be masked."""

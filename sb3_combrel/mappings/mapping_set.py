@@ -272,8 +272,10 @@ class MappingSet:
         if not 0 <= number < self.n_mappings:
             raise IndexError(f"mapping {index} does not exist, the set has {self.n_mappings}")
         row, action_index = divmod(number, self.n_action_mappings) if self.pairs is None else self.pairs[number].tolist()
-        sign = self.signs[row].tolist()
-        return InterTaskMapping(_state(self.state_mappings[row]), self.actions[action_index], sign, names=self.names)
+        return self._mapping(row, self.actions[action_index])
+
+    def _mapping(self, row: int, action: tuple[int, ...]) -> InterTaskMapping:
+        return InterTaskMapping(_state(self.state_mappings[row]), action, self.signs[row].tolist(), names=self.names)
 
     @property
     def combines_freely(self) -> bool:
@@ -294,7 +296,8 @@ class MappingSet:
 
     def source_actions_for(self, action: int) -> Ints:
         """The source actions, ascending, that a target action is mapped to; ``ValueError`` if there is no such action."""
-        self._check_action(action)
+        if not 0 <= action < self.n_target_actions:
+            raise ValueError(f"action must be a target action from 0 to {self.n_target_actions - 1}, got {action}")
         return self.actions.source_actions_for(action) if self.pairs is None else np.unique(self._source_actions[:, action])
 
     def candidates(self, action: int) -> tuple[Ints, Ints]:
@@ -313,24 +316,12 @@ class MappingSet:
         different = np.unique(np.column_stack([self._states, self._source_actions[:, action]]), axis=0)
         return different[:, 0].copy(), different[:, 1].copy()
 
-    def find(self, state_index: int, action: int, source_action: int) -> int:
-        """The first mapping with this state mapping (or an equal one) that maps ``action`` to ``source_action``.
+    def of_candidate(self, state_index: int, source_action: int) -> InterTaskMapping:
+        """What a candidate is, for its target action: a state mapping of the set, with one source action for all actions.
 
         :param state_index: row of ``state_mappings``
-        :return: its number, to be used as ``mapping_set[number]``
-        :raises ValueError: if there is none
         """
-        self._check_action(action)
-        if self.pairs is None:
-            first = int(self._first_equal[state_index])
-            return first * self.n_action_mappings + self.actions.first(action, source_action)
-        same_state = self._states == self._first_equal[state_index]
-        matching = np.flatnonzero(same_state & (self._source_actions[:, action] == source_action))
-        if not matching.size:
-            raise ValueError(
-                f"no mapping of the set has state mapping {state_index} and source action {source_action} for {action}"
-            )
-        return int(matching[0])
+        return self._mapping(state_index, (source_action,) * self.n_target_actions)
 
     def check(self, **sizes: Unpack[TaskSizes]) -> None:
         """Check all state and action mappings against the spaces of the tasks, see :meth:`InterTaskMapping.check`."""
@@ -351,10 +342,6 @@ class MappingSet:
         n_mappings, n_actions = (count_text(n).replace(",", "") for n in (self.n_mappings, self.n_action_mappings))
         listed, times = ("", " x") if self.pairs is None else (" listed one by one", ",")
         return f"<{n_mappings} mappings{listed}: {self.n_state_mappings} state mappings{times} {n_actions} action mappings>"
-
-    def _check_action(self, action: int) -> None:
-        if not 0 <= action < self.n_target_actions:
-            raise ValueError(f"action must be a target action from 0 to {self.n_target_actions - 1}, got {action}")
 
 
 def _state(row: Ints) -> tuple[int | None, ...]:

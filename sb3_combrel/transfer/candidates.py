@@ -135,14 +135,12 @@ class Candidates:
         """Return a candidate's parts, by name."""
         number, action, state_index, source_action = self.origins[candidate]
         mappings, names = self.sets[number], self.sources[number].action_names
+        variables = mappings.of_candidate(state_index, source_action).variables_by_name()
+        of_all: tuple[str, ...] = ()
         if self.whole:
-            mapping = mappings[candidate - int(self.arrays.first[action]) - sum(map(len, self.sets[:number]))]
-        else:
-            mapping = mappings[mappings.find(state_index, action, source_action)]
-        words = repr(mapping)
-        variables = words[words.index("(") + 1 : words.index(";")]
-        whole_actions = tuple(names[each] for each in mapping.action) if self.whole else ()
-        return Candidate(action, names[source_action], variables, whole_actions)
+            member = candidate - int(self.arrays.first[action]) - sum(map(len, self.sets[:number]))
+            of_all = tuple(names[each] for each in mappings[member].action)
+        return Candidate(action, names[source_action], variables, of_all)
 
     def mapped_variables(self, candidate: int) -> MappedVariables:
         """Return what a candidate makes of each target variable, in numbers."""

@@ -194,9 +194,8 @@ def slow_compliance(model):
 
     @functools.cache
     def compliance(candidate, i):
-        _, action, state_index, source_action = candidates.origins[candidate]
-        mappings = candidates.sets[0]
-        mapping = mappings[mappings.find(state_index, action, source_action)]
+        _, _, state_index, source_action = candidates.origins[candidate]
+        mapping = candidates.sets[0].of_candidate(state_index, source_action)
         return naive.compliance(transitions[i], source, mapping, bandwidths)
 
     means = []

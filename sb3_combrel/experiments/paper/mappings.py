@@ -60,7 +60,7 @@ def best_mappings(source: SourceInstances, target: SourceInstances, mappings: Ma
         candidates = zip(*mappings.candidates(action), strict=True)
         errors = {pair: _error(source, states, effects, mappings, *pair) for pair in candidates}
         state_index, source_action = min(errors, key=lambda pair: errors[pair])
-        found.append(mappings[mappings.find(int(state_index), action, int(source_action))])
+        found.append(mappings.of_candidate(int(state_index), int(source_action)))
     return found
 
 
