@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -90,7 +90,7 @@ class SourcePrior:
         self._all_measured = max(ALL_MEASURED, first_renewal)
         self._warned = False
         self.choice: Choice | None = None
-        self._stored: dict[tuple[int, int, int], tuple[np.ndarray, np.ndarray, Predicted]] = {}
+        self._stored: dict[tuple[bytes, bytes], Predicted] = {}
         if isinstance(choose, Choice):
             self.set_choice(choose)
 
@@ -108,16 +108,12 @@ class SourcePrior:
         """Predictions and coverage. Those of many pairs at once are stored: their weights change more often."""
         if len(actions) < MANY:
             return self.copies.predict(self._used, states, actions)
-        asked = len(actions), int(actions[0]), int(actions[-1])
-        if asked in self._stored:
-            last_states, last_actions, predicted = self._stored[asked]
-            if np.array_equal(last_actions, actions) and np.array_equal(last_states, states):
-                return predicted
-        predicted = self.copies.predict(self._used, states, actions)
-        if len(self._stored) > self.task.n_actions:
-            self._stored.clear()
-        self._stored[asked] = states.copy(), actions.copy(), predicted
-        return predicted
+        asked = states.tobytes(), actions.tobytes()
+        if asked not in self._stored:
+            if len(self._stored) > self.task.n_actions:
+                self._stored.clear()
+            self._stored[asked] = self.copies.predict(self._used, states, actions)
+        return self._stored[asked]
 
     def observe(self, state: np.ndarray, action: int, reward: float, effect: np.ndarray, terminated: bool) -> None:
         """Take in a transition of the target; ``effect``: next state minus state, unit coordinates, shape (n_variables,)."""
@@ -159,7 +155,7 @@ class SourcePrior:
     def value_bound(self) -> np.ndarray | None:
         """The source's values and :attr:`excess`, at most ``max_value``; None unless effects and rewards are explained."""
         bound = self._bound()
-        return None if bound is None else np.minimum(bound + self.excess, self._value_bound.max_value)
+        return None if bound is None else np.minimum(bound + self.excess, self.task.max_value)
 
     def _bound(self) -> np.ndarray | None:
         if self.bounding is None or not self.transfer_terminals or not self.explains:
@@ -218,7 +214,7 @@ class SourcePrior:
 
     def _renew(self, choose: bool) -> None:
         if choose and self.choose is not None:
-            choice = self._of_best_source(self.choose(self.sums))
+            choice = best_source(self.copies, self.sums, self.choose(self.sums), self.transitions)
             if not choice.same(self.choice):
                 self.n_switches += self.choice is not None
                 self.set_choice(choice)
@@ -240,16 +236,11 @@ class SourcePrior:
             return
         choice = self.choice
         whole = whole_part(self.copies, choice) if self.whole else choose_whole(self.copies, self.sums, choice)
-        whole = self._of_best_source(whole)
+        whole = best_source(self.copies, self.sums, whole, self.transitions)
         bounding = best_ending(self.copies, self.sums, whole, self.transitions)
         if not bounding.same(self.bounding):
             self.bounding, self.excess, self.version = bounding, 0.0, self.version + 1
             self.explains = self._explains()
-
-    def _of_best_source(self, choice: Choice) -> Choice:
-        """The same, but through other sources where they foretell rewards and ends better."""
-        several = len(self.copies.sources) > 1
-        return best_source(self.copies, self.sums, choice, self.transitions) if several else choice
 
     def set_choice(self, choice: Choice) -> None:
         """Predict through these copies from now on."""
@@ -269,31 +260,29 @@ class SourcePrior:
 
     def _in_copies(self) -> np.ndarray:
         """Which variables each target action's copies have, bool, shape (n_target_actions, n_variables)."""
-        found = np.zeros((self.task.n_actions, self.task.n_variables), dtype=np.bool_)
-        for a, _, _, has in self._moves():
-            found[a] |= has
-        return found
+        if self.choice is None:
+            return np.zeros((self.task.n_actions, self.task.n_variables), dtype=np.bool_)
+        copies, actions = self.choice
+        moved = (copies >= 0) & (actions >= 0)
+        return np.asarray((moved[:, :, None] & (self.copies.state[copies] >= 0)).any(axis=1))
 
     def change_optimism(self, gamma: float, max_value: float) -> None:
         """As of ``Transfer``."""
-        self._value_bound.change_optimism(gamma, max_value)
+        self.task = replace(self.task, gamma=gamma, max_value=max_value)
+        self._value_bound = ValueBound(self.copies, self.task)
 
     def _moved(self, action: int) -> list[tuple[int, int]]:
         """The copies that a target action moves, and the source actions by which it does."""
         return [] if self.choice is None else self.choice.moves(action)
 
-    def _moves(self) -> Iterator[tuple[int, int, int, np.ndarray]]:
-        """Of each target action: each copy that it moves, by which source action, and which variables the copy has."""
-        for a in range(self.task.n_actions):
-            for copy, used in self._moved(a):
-                yield a, copy, used, self.copies.state[copy] >= 0
-
     def error(self) -> float:
         """Return the mean squared error of the mapping in use over that of "no change", on the steps compared; NaN without."""
         baseline = float(self.sums.effect.sum())
         errors = self.sums.effect.copy()
-        for a, copy, used, has in self._moves():
-            errors[a, has] = self.sums.error[copy, a, used, has]
+        for a in range(self.task.n_actions):
+            for copy, used in self._moved(a):
+                has = self.copies.state[copy] >= 0
+                errors[a, has] = self.sums.error[copy, a, used, has]
         return float(errors.sum()) / baseline if baseline > 0.0 else np.nan
 
     def strengths(self) -> np.ndarray:

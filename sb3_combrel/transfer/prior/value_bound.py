@@ -36,12 +36,7 @@ class ValueBound:
 
     def __init__(self, copies: Copies, task: TargetTask):
         self._copies = copies
-        self._sample_states = task.sample_states
-        self.change_optimism(task.gamma, task.max_value)
-
-    def change_optimism(self, gamma: float, max_value: float) -> None:
-        """Plan in the sources anew, with another discount factor and another value of what is unknown there."""
-        self._gamma, self.max_value = gamma, max_value
+        self._task = task
         #: By number of the source: a planner that has its values.
         self._planners: dict[int, Planner] = {}
         self._of_copy: dict[int, np.ndarray] = {}
@@ -70,7 +65,7 @@ class ValueBound:
         """
         states, returns, to_go = np.array([state for state, *_ in episode]), np.zeros(len(episode)), 0.0
         for i in range(len(episode) - 1, -1, -1):
-            returns[i] = to_go = episode[i][1] + self._gamma * to_go
+            returns[i] = to_go = episode[i][1] + self._task.gamma * to_go
         seen = [self._seen_by(copy, states) for copy in choice.same_copies()]
         bounds = np.minimum.reduce([of.values[of.mdp.grid.cells_around(at)].max(axis=1) for of, at in seen])
         return float((returns - bounds).max(initial=0.0))
@@ -82,7 +77,7 @@ class ValueBound:
     def _bound(self, copy: int) -> np.ndarray:
         """The source's value at the state that each state of the target's sample is in a copy."""
         if copy not in self._of_copy:
-            planner, at = self._seen_by(copy, self._sample_states)
+            planner, at = self._seen_by(copy, self._task.sample_states)
             different, kind = distinct_rows(at)
             self._of_copy[copy] = np.array([planner.mdp.grid.interpolate(planner.values, at[i]) for i in different])[kind]
         return self._of_copy[copy]
@@ -99,8 +94,9 @@ class ValueBound:
         """Plan in a source, from above: values are upper bounds after any number of sweeps."""
         taken, actions = np.unique(source.actions, return_inverse=True)
         source = dataclasses.replace(source, actions=actions, n_actions=len(taken), action_names=())
+        gamma, max_value = self._task.gamma, self._task.max_value
         # Lower than so many sweeps can get.
-        lowest = min(0.0, self.max_value) + (MAX_SWEEPS + 1) * MAX_STEPS * min(0.0, float(source.rewards.min())) - 1.0
-        _, planner = plan_source(source, self._gamma, self._copies.breadth, LEAST_WEIGHT, (lowest, self.max_value))
+        lowest = min(0.0, max_value) + (MAX_SWEEPS + 1) * MAX_STEPS * min(0.0, float(source.rewards.min())) - 1.0
+        _, planner = plan_source(source, gamma, self._copies.breadth, LEAST_WEIGHT, (lowest, max_value))
         planner.sweep(MAX_SWEEPS)
         return planner
