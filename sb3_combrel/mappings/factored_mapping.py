@@ -53,16 +53,6 @@ class FactoredMapping:
         """Whether there are names that have not been replaced by numbers yet."""
         return any(each.has_names for each in self.copies)
 
-    @property
-    def n_target_variables(self) -> int:
-        """Number of variables of the target task."""
-        return self.copies[0].n_target_variables
-
-    @property
-    def n_target_actions(self) -> int:
-        """Number of actions of the target task."""
-        return self.copies[0].n_target_actions
-
     def check(self, **sizes: Unpack[TaskSizes]) -> None:
         """Check every copy against the spaces of the two tasks, see :meth:`InterTaskMapping.check`."""
         for each in self.copies:

@@ -68,7 +68,7 @@ def target_task(n_variables, n_actions):
 def walk(mapping, n, seed=0, length=40, spread=0.5):
     """States, actions and effects of such a target, in episodes that start at random and end after ``length`` steps."""
     rng = np.random.default_rng(seed)
-    d, n_actions = mapping.n_target_variables, mapping.n_target_actions
+    d, n_actions = mapping.copies[0].n_target_variables, mapping.copies[0].n_target_actions
     rows = []
     while len(rows) < n:
         state, action = 0.5 + spread * (rng.random(d) - 0.5), int(rng.integers(n_actions))
@@ -109,7 +109,7 @@ def measured(n_copies, n, noise=0.0, order=None, seed=0):
     effects = effects + noise * np.random.default_rng(seed).normal(size=effects.shape)
     rows = copies_of_source(2, 2 * n_copies)
     copies = Copies([oscillator_source()], np.zeros(len(rows), dtype=np.int64), rows, np.ones_like(rows), 0.2)
-    sums = CopySums.zero(len(copies), 3, mapping.n_target_actions, 2 * n_copies)
+    sums = CopySums.zero(len(copies), 3, mapping.copies[0].n_target_actions, 2 * n_copies)
     for state, action, effect in zip(states, actions.tolist(), effects, strict=True):
         copies.measure(state, action, effect, sums)
     return mapping, copies, sums, (states, actions, effects)

@@ -154,7 +154,7 @@ def test_images_are_the_same_but_for_signs_and_have_more_than_half_the_evidence(
     mapping, (states, actions, effects) = f.copies_mapping(n_copies), f.walk(f.copies_mapping(n_copies), 60)
     rows, sign = with_mirrored(copies_of_source(2, 2 * n_copies))
     copies = Copies([f.oscillator_source()], np.zeros(len(rows), dtype=np.int64), rows, sign, 0.2)
-    sums = CopySums.zero(len(copies), 3, mapping.n_target_actions, 2 * n_copies)
+    sums = CopySums.zero(len(copies), 3, mapping.copies[0].n_target_actions, 2 * n_copies)
     for state, action, effect in zip(states, actions.tolist(), effects, strict=True):
         copies.measure(state, action, effect, sums)
     choice, scores = prior_choice.choose_factored(copies, sums), prior_choice.scores_of(copies, sums)
