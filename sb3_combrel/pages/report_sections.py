@@ -9,7 +9,7 @@ import numpy as np
 
 from sb3_combrel.pages.page import Cell, PageTable, Section
 from sb3_combrel.pages.palette import mapping_colours
-from sb3_combrel.transfer.report import NO_MAPPING, NOWHERE, Contradiction, MappingReport, TransferReport
+from sb3_combrel.transfer.report import NOWHERE, Contradiction, MappingReport, TransferReport
 
 NONE, ANOTHER = "—", "another in each run"
 FIGURES = {
@@ -88,13 +88,8 @@ def _mean(values: Sequence[float]) -> str:
 
 def contradictions_text(report: TransferReport) -> str:
     """Say how often a source was contradicted."""
-    if report.says_nothing:
-        return NO_MAPPING
-    if not report.n_compared:
-        return "No prediction of the source has been compared with what happened."
-    share = f"{report.n_worse:,} ({100 * report.n_worse / report.n_compared:.0f} %)"
-    nowhere = "" if report.contradictions else f" {NOWHERE}"
-    return f'Compared on {report.n_compared:,} steps, the source was worse than "no change" on {share}.{nowhere}'
+    nowhere = bool(report.n_compared) and not report.says_nothing and not report.contradictions
+    return report.comparison + (f" {NOWHERE}" if nowhere else "")
 
 
 def contradictions_table(reports: Mapping[str, TransferReport]) -> PageTable | None:
@@ -113,4 +108,4 @@ def contradictions_table(reports: Mapping[str, TransferReport]) -> PageTable | N
 
 def _contradiction(each: Contradiction) -> tuple[str, str, str, str]:
     error = "nothing moved" if np.isinf(each.error) else f"{each.error:.2f}"
-    return each.target_action, f"{each.variable} from {each.low:.3g} to {each.high:.3g}", error, f"{each.n_compared:,}"
+    return each.target_action, each.where, error, f"{each.n_compared:,}"

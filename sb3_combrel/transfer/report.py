@@ -63,10 +63,14 @@ class Contradiction:
     n_compared: int  #: transitions there
     error: float  #: mean squared error of the effects over that of "no change", above 1; infinite where nothing moved
 
+    @property
+    def where(self) -> str:
+        """The part in words."""
+        return f"{self.variable} from {self.low:.3g} to {self.high:.3g}"
+
     def __str__(self) -> str:
         times = "nothing moved there, the source says it does" if np.isinf(self.error) else f"{self.error:.2f}"
-        where = f"{self.variable} from {self.low:.3g} to {self.high:.3g}"
-        return f"{self.target_action}, {where}: {times} ({self.n_compared:,} steps)"
+        return f"{self.target_action}, {self.where}: {times} ({self.n_compared:,} steps)"
 
 
 @dataclass(frozen=True)
@@ -137,6 +141,16 @@ class TransferReport:
         nothing = self.use == "prior" and bool(self.mappings) and all(np.isnan(each.strength) for each in self.mappings)
         return nothing and bool(self.n_steps)
 
+    @property
+    def comparison(self) -> str:
+        """How often the source was worse than "no change", in one sentence."""
+        if self.says_nothing:
+            return NO_MAPPING
+        if not self.n_compared:
+            return "No prediction of the source has been compared with what happened."
+        share = f"{self.n_worse:,} ({100 * self.n_worse / self.n_compared:.0f} %)"
+        return f'Compared on {self.n_compared:,} steps, the source was worse than "no change" on {share}.'
+
     def __str__(self) -> str:
         if self.use == "none":
             return self.sentence
@@ -187,16 +201,10 @@ class TransferReport:
         return "\n".join(lines)
 
     def _contradictions(self) -> str:
-        if self.says_nothing:
-            return NO_MAPPING
-        if not self.n_compared:
-            return "No prediction of the source has been compared with what happened." if self.mappings else ""
-        lines = [
-            f'Compared on {self.n_compared:,} steps, the source was worse than "no change" on {self.n_worse:,} '
-            f"({100 * self.n_worse / self.n_compared:.0f} %)."
-        ]
+        if self.says_nothing or not self.n_compared:
+            return self.comparison if self.mappings else ""
         where = [f"  {each}" for each in self.contradictions]
-        lines += ["Contradicted (prediction error above 1):", *where] if where else [NOWHERE]
+        lines = [self.comparison, *(["Contradicted (prediction error above 1):", *where] if where else [NOWHERE])]
         for name, (right, wrong) in (("Ends of episodes", self.ends), ("Rewards", self.rewards)):
             if right or wrong:
                 lines.append(f"{name}: {right:,} as the source predicts, {wrong:,} not.")
