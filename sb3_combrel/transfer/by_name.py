@@ -61,18 +61,13 @@ def check_argument_names(method: type, arguments: Iterable[str]) -> None:
 
 
 def _method(name: str) -> Any:
-    module_name, _, attribute = name.replace(":", ".").rpartition(".")
-    # The package's own transfer methods that are complete, by their public names.
-    own = {_name(each): each for each in _subclasses(Transfer) if each.__module__.startswith(METHODS)}
-    own = {name: each for name, each in own.items() if not inspect.isabstract(each)}
-    public = _public(f"{module_name or PACKAGE}.{attribute}")
-    if public in own:
-        return own[public]
+    module_name, _, attribute = _public(name.replace(":", ".")).rpartition(".")
     try:
         return getattr(importlib.import_module(module_name or PACKAGE), attribute)
     except (ImportError, AttributeError, ValueError) as error:
-        close = did_you_mean(attribute, [each.rpartition(".")[2] for each in own])
-        known = ", ".join(sorted(own))
+        own = [each for each in _subclasses(Transfer) if each.__module__.startswith(METHODS) and not inspect.isabstract(each)]
+        close = did_you_mean(attribute, [each.__name__ for each in own])
+        known = ", ".join(sorted(map(_name, own)))
         hint = f"; a file is the source of a method, transfer=COMBREL({name!r})" if name.endswith(SUFFIXES) else close
         raise ValueError(f"transfer names {name!r}, which is no transfer method; known are {known}{hint}") from error
 
