@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -218,13 +219,29 @@ def draw_factored(copies: Copies, n_actions: int, rng: np.random.Generator) -> C
     All divisions of as many target variables as possible into as few copies as possible are equally likely, and so are all
     source actions, each copy's and each target action's on its own.
     """
-    members = copies.state >= 0
-    n_variables = members.shape[1]
-    masks = variables_of(members).tolist()
-    ways = _count_divisions(masks, n_variables)
+    masks = variables_of(copies.state >= 0).tolist()
+    full = (1 << copies.state.shape[1]) - 1
+
+    @cache
+    def best_ways(taken: int) -> tuple[tuple[int, int], int, list[tuple[int, int, int]]]:
+        """What the best divisions of the rest leave out, how many copies they have, how many there are, and how they go on.
+
+        By a copy that has the first variable that is not taken, and no other that is, or it stays (copy -1); in how many ways.
+        """
+        if taken == full:
+            return (0, 0), 1, []
+        first = ~taken & (taken + 1)
+        fit = [(mask, copy) for copy, mask in enumerate(masks) if mask & first and not mask & (taken | (first - 1))]
+        found: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
+        for mask, copy in [*fit, (first, -1)]:
+            (left, n_copies), n, _ = best_ways(taken | mask)
+            found.setdefault((left + (copy < 0), n_copies + (copy >= 0)), []).append((mask, copy, n))
+        best, options = min(found.items())
+        return best, sum(n for *_, n in options), options
+
     taken, chosen = 0, []
-    while taken < (1 << n_variables) - 1:
-        _, options = _best_continuations(taken, masks, ways)
+    while taken < full:
+        *_, options = best_ways(taken)
         counts = np.array([n for *_, n in options], dtype=np.float64)
         mask, copy, _ = options[int(rng.choice(len(options), p=counts / counts.sum()))]
         taken |= mask
@@ -233,31 +250,3 @@ def draw_factored(copies: Copies, n_actions: int, rng: np.random.Generator) -> C
     of_source = copies.table.n_actions[chosen]
     actions = rng.integers(0, of_source, size=(n_actions, len(chosen)))
     return Choice(np.tile(np.array(chosen, dtype=np.int64), (n_actions, 1)), actions.astype(np.int64))
-
-
-# For each set of variables that are divided already: variables that the rest leaves out, copies that it has, how many ways.
-Ways = dict[int, tuple[int, int, int]]
-
-
-def _count_divisions(masks: list[int], n_variables: int) -> Ways:
-    """Count how many ways there are to divide the remaining variables, with as few left out and in as few copies as can be."""
-    full = (1 << n_variables) - 1
-    ways: Ways = {full: (0, 0, 1)}
-    for taken in range(full - 1, -1, -1):
-        (left, n_copies), options = _best_continuations(taken, masks, ways)
-        ways[taken] = left, n_copies, sum(n for *_, n in options)
-    return ways
-
-
-def _best_continuations(taken: int, masks: list[int], ways: Ways) -> tuple[tuple[int, int], list[tuple[int, int, int]]]:
-    """What the best divisions of the rest leave out and how many copies they have; how they go on, and in how many ways each.
-
-    By a copy that has the first variable that is not taken, and no other that is; or it stays (copy -1).
-    """
-    first = ~taken & (taken + 1)
-    fit = [(mask, copy) for copy, mask in enumerate(masks) if mask & first and not mask & (taken | (first - 1))]
-    found: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
-    for mask, copy in [*fit, (first, -1)]:
-        left, n_copies, n = ways[taken | mask]
-        found.setdefault((left + (copy < 0), n_copies + (copy >= 0)), []).append((mask, copy, n))
-    return min(found.items())
