@@ -12,8 +12,8 @@ from sb3_combrel.common.kernels import nearest_instances
 from sb3_combrel.common.regression import Kernel, LocalFit, fit_around, known_weight, number_at
 
 DEFAULT_SOURCE_BREADTH = 0.2
-DEFAULT_N_NEIGHBORS = 24
-DEFAULT_OUTCOME_BREADTH = 0.05  # rewards and ends jump from one state to the next: they are averaged over nearer instances
+N_NEIGHBORS = 24
+OUTCOME_BREADTH = 0.05  # rewards and ends jump from one state to the next: they are averaged over nearer instances
 
 
 class SourcePredictions(NamedTuple):
@@ -84,28 +84,22 @@ def predict_many(source, states, actions, predictions):
 class SourceModel:
     """Local linear regression on the instances of a source, one model for each action.
 
-    The effect at a state is fitted, as a linear function of the state, to the ``n_neighbors`` nearest instances of the
+    The effect at a state is fitted, as a linear function of the state, to the ``N_NEIGHBORS`` nearest instances of the
     action, with the kernel exp(-d^2 / breadth^2), narrowed where they lie closer so that the last of them weighs 0.05; it
-    stays within the range of theirs. Rewards and ends are averages with a kernel of ``outcome_breadth``. Far from
+    stays within the range of theirs. Rewards and ends are averages with a kernel of ``OUTCOME_BREADTH``. Far from
     all instances the nearest ones still predict, with a small weight.
 
     The weight of a prediction is the sum of exp(-d^2 / breadth^2) over these instances, divided by 1 + z^2, where z is how
     far the state is from their mean in units of their spread along that way: so the variance of what a linear fit predicts
-    grows. All of it is in unit coordinates of the source; ``outcome_breadth`` is no broader than ``breadth``.
+    grows. All of it is in unit coordinates of the source; ``OUTCOME_BREADTH`` is no broader than ``breadth``.
     """
 
-    def __init__(
-        self,
-        instances: Instances,
-        breadth: float = DEFAULT_SOURCE_BREADTH,
-        n_neighbors: int = DEFAULT_N_NEIGHBORS,
-        outcome_breadth: float = DEFAULT_OUTCOME_BREADTH,
-    ):
+    def __init__(self, instances: Instances, breadth: float):
         d = instances.state.shape[2]
         self.n_variables, self.instances = d, instances
-        self.kernel = Kernel(-1.0 / breadth**2, np.inf, n_neighbors, min(breadth, outcome_breadth) ** 2)
+        self.kernel = Kernel(-1.0 / breadth**2, np.inf, N_NEIGHBORS, min(breadth, OUTCOME_BREADTH) ** 2)
         #: For compiled code, see :func:`source_arrays`.
-        self.plain = tuple(instances), tuple(self.kernel), tuple(LocalFit.empty(n_neighbors, d)), np.zeros(d)
+        self.plain = tuple(instances), tuple(self.kernel), tuple(LocalFit.empty(N_NEIGHBORS, d)), np.zeros(d)
 
     def predict(self, states: np.ndarray, actions: np.ndarray) -> SourcePredictions:
         """Predict n states and actions of the source; unit coordinates of it, and int64."""
