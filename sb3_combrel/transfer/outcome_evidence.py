@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -52,17 +53,13 @@ class OutcomeEvidence:
         self.rewards_right = self.rewards_wrong = 0
         #: Number of the environment that the next transition is from; and the steps of its visit, by environment.
         self.environment = 0
-        self._visits: dict[int, int] = {}
+        self._visits: Counter[int] = Counter()
         self.reward_range = (np.inf, -np.inf)
 
     @property
     def steps_of_visit(self) -> int:
         """How long the environment has been where an end is predicted."""
-        return self._visits.get(self.environment, 0)
-
-    @steps_of_visit.setter
-    def steps_of_visit(self, steps: int) -> None:
-        self._visits[self.environment] = steps
+        return self._visits[self.environment]
 
     def note(self, predicted: tuple[float, float] | None, reward: float, terminated: bool) -> None:
         """Take in a transition; ``predicted``: probability of termination, and reward; None where the source has no data."""
@@ -76,9 +73,9 @@ class OutcomeEvidence:
                 self.confirmed += 1
             elif predicted is not None:
                 self.unpredicted += 1
-            self.steps_of_visit = 0
+            self._visits[self.environment] = 0
         elif end > ENDS or (self.steps_of_visit and end >= GOES_ON):
-            self.steps_of_visit += 1
+            self._visits[self.environment] += 1
             self.absent += self.steps_of_visit % STEPS_OF_A_VISIT == 0
         else:
             self._leave()
@@ -94,7 +91,7 @@ class OutcomeEvidence:
 
     def _leave(self) -> None:
         self.absent += 0 < self.steps_of_visit < STEPS_OF_A_VISIT
-        self.steps_of_visit = 0
+        self._visits[self.environment] = 0
 
     @property
     def contradicted(self) -> int:
@@ -119,7 +116,7 @@ class OutcomeEvidence:
 
     @visits.setter
     def visits(self, rows: np.ndarray) -> None:
-        self._visits = {int(environment): int(steps) for environment, steps in rows}
+        self._visits = Counter({int(environment): int(steps) for environment, steps in rows})
 
 
 class RegionErrors:
