@@ -33,6 +33,7 @@ from sb3_combrel.pages.snapshot import snapshot_of
 from sb3_combrel.tensorboard.history import ChoiceHistory
 from sb3_combrel.transfer.base import Transfer
 from sb3_combrel.transfer.methods.mapping_transfer import MappingTransfer
+from sb3_combrel.transfer.prior.prior_history import evidence_points
 
 MAX_ROWS = 14
 WIDTH = 6.4  # inches
@@ -74,7 +75,7 @@ def evidence_of_agent(agent: FittedRMaxAgent, width: float) -> Figure:
     transfer = agent.transfer
     assert isinstance(transfer, MappingTransfer)
     prior = transfer.source_prior
-    points = prior.history.points(prior)
+    points = evidence_points(prior)
     return evidence_figure(points, agent.task.action_names, colours_of_mappings(transfer), width)
 
 

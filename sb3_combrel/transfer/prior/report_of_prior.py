@@ -9,6 +9,7 @@ import numpy as np
 from sb3_combrel.transfer.equations import prediction_compliances
 from sb3_combrel.transfer.prior.evidence import SMALLEST_ERROR
 from sb3_combrel.transfer.prior.prior_choice import Choice, best_actions
+from sb3_combrel.transfer.prior.prior_history import evidence_points
 from sb3_combrel.transfer.prior.source_prior import SourcePrior
 from sb3_combrel.transfer.report import MappingReport, TransferReport, describe_sources
 
@@ -71,7 +72,7 @@ def report_of_prior(method: str, prior: SourcePrior, statistics: Mapping[str, fl
         why_unbounded=prior.why_unbounded(),
         bounded_through=bounding if bound is not None and bounding != in_use else "",
         statistics=statistics,
-        history=prior.history.points(prior),
+        history=evidence_points(prior),
         **prior.errors.report_fields(),
     )
 

@@ -16,7 +16,7 @@ from sb3_combrel.transfer.prior.evidence import FIRST_RENEWAL, RENEWAL_GROWTH, O
 from sb3_combrel.transfer.prior.image_ends import best_ending, best_source
 from sb3_combrel.transfer.prior.prior_candidates import PriorCandidates
 from sb3_combrel.transfer.prior.prior_choice import Choice, Chooser, choose_whole, whole_part
-from sb3_combrel.transfer.prior.prior_history import PriorHistory
+from sb3_combrel.transfer.prior.prior_history import N_FIRST, belief
 from sb3_combrel.transfer.prior.value_bound import Episode, ValueBound
 from sb3_combrel.transfer.recorded_transitions import RecordedTransitions
 
@@ -72,8 +72,8 @@ class SourcePrior:
         self.evidence = PriorEvidence(task.n_actions, task.n_variables, largest)
         #: Errors of the mapping in use, where the source has data.
         self.errors = RegionErrors(task)
-        #: The evidence over time.
-        self.history = PriorHistory(task.n_actions)
+        #: The evidence over time, see ``belief``.
+        self.history: list[np.ndarray] = []
         self._own: OwnPrediction | None = None
         #: Number of the environment that the transitions observed now come from.
         self.environment = 0
@@ -210,7 +210,7 @@ class SourcePrior:
             if excess > self.excess:
                 self.excess, self.version = excess, self.version + 1
         if self.version > version:
-            self.history.note(self)
+            self._note_belief()
 
     def _renew(self, choose: bool) -> None:
         if choose and self.choose is not None:
@@ -222,7 +222,14 @@ class SourcePrior:
                 self.version += 1
         self._renew_bounding()
         self._renew_evidence()
-        self.history.note(self)
+        self._note_belief()
+
+    def _note_belief(self) -> None:
+        """Add what is believed now to the history, in place of what was at the same step."""
+        row = belief(self)
+        if self.history and self.history[-1][0] == row[0]:
+            self.history.pop()
+        self.history.append(row)
 
     def _renew_evidence(self) -> None:
         if self.choice is not None:
@@ -336,7 +343,7 @@ class SourcePrior:
             "prior_figures": np.array(figures, dtype=np.float64),
             "prior_errors": self.errors.sums.ravel().copy(),
             "prior_uses": self.candidates.get_state(),
-            "prior_history": self.history.get_state(),
+            "prior_history": np.array(self.history, dtype=np.float64).reshape(-1, N_FIRST + 2 * self.task.n_actions),
             **{f"prior_sums_{name}": array.ravel().copy() for name, array in self.sums._asdict().items()},
         }
 
@@ -360,7 +367,7 @@ class SourcePrior:
             self._episodes[int(row[0])].append((row[1 : d + 1].copy(), float(row[d + 1]), row[d + 2 :].copy()))
         self.errors.sums.ravel()[:] = state["prior_errors"]
         self.candidates.set_state(state["prior_uses"])
-        self.history.set_state(state["prior_history"])
+        self.history = list(state["prior_history"].copy())
 
     def _restored(self, numbers: np.ndarray) -> Choice:
         """A choice of copies and actions that there are, whatever a file says; shape (2, n_target_actions, n)."""
