@@ -254,7 +254,8 @@ def test_the_most_probable_parts_come_first_and_add_up_to_one(max_terms, mass):
 
 def mixture(n_target=3):
     """The predictions of a random mixture, and what they are made of."""
-    model = SourceModel(stacked_instances([f.oscillator_source(200, rewards=lambda states: states[:, 0])]))
+    source = f.oscillator_source(200, rewards=lambda states: states[:, 0])
+    model = SourceModel(stacked_instances([source]), 0.2)
     rng, readings = np.random.default_rng(0), soft.all_readings(2, n_target, True)
     logits = soft.Logits(rng.normal(size=(2, 2, 2 * n_target)), rng.normal(size=(2, 4, 3)))
     predictions = soft.MixturePredictions(model, readings, np.array([0.5, 0.5]))
