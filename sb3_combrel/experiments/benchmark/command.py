@@ -79,8 +79,8 @@ def benchmark(
         console.print(few, markup=False, soft_wrap=True)
     all_seeds = range(first_seed, first_seed + seeds)
     sources, failed = prepare_sources(chosen_pairs, all_seeds, output, backend, console)
-    for pair in chosen_pairs:
-        pair.check_known(next((given for seed in all_seeds if (given := sources[pair.name, seed])), ()))
+    any_sources = [next((given for seed in all_seeds if (given := sources[pair.name, seed])), ()) for pair in chosen_pairs]
+    chosen_pairs = [pair.check_known(given) for pair, given in zip(chosen_pairs, any_sources, strict=True)]
     jobs = jobs_of(chosen_pairs, chosen_methods, all_seeds, sources)
     results = run_missing([job for job in jobs if (job.group, job.seed) not in failed], output, backend, console)
     results += [job.result(error=failed[job.group, job.seed]) for job in jobs if (job.group, job.seed) in failed]

@@ -6,14 +6,15 @@ import functools
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
 from sb3_combrel import FactoredMapping, InterTaskMapping, SourceInstances
-from sb3_combrel.common.checks import check_count, check_finite
+from sb3_combrel.common.attributes import names_of
+from sb3_combrel.common.checks import check_count, check_finite, checked_names
 from sb3_combrel.experiments.suite.tasks import Source, check_budget
 from sb3_combrel.mappings.named_sets import check_mappings
 from sb3_combrel.runs.described import described
@@ -138,28 +139,35 @@ class Pair:
         """Make the environment of the target task."""
         return make_env(self.target)
 
-    def check_known(self, sources: Sequence[SourceInstances]) -> None:
-        """Check that ``known_by_action`` has the variables and actions of both tasks.
+    def check_known(self, sources: Sequence[SourceInstances]) -> Pair:
+        """Check that ``known_by_action`` has the variables and actions of both tasks; the pair with numbers for its names.
 
         :param sources: instances of each source; none: nothing is checked
         :raises ValueError: if it has not
         """
         if self.known_by_action is None or not sources:
-            return
+            return self
         try:
             with closing(self.make_target()) as env:
                 n_variables, n_actions = env.observation_space.shape[0], int(env.action_space.n)  # type: ignore
+                names = names_of(env)
         except Exception:  # a third party's environment raises what it likes: that of the runs is reported
-            return
+            return self
         one = isinstance(self.known_by_action, InterTaskMapping)
         by_action: Sequence[InterTaskMapping] = [self.known_by_action] * n_actions if one else self.known_by_action  # type: ignore
         right = f"known_by_action must have one mapping for each of the {n_actions} target actions"
         self._check(len(by_action) == n_actions, f"{right}, got {len(by_action)}")
         right = f"sources_by_action must have one number for each of the {n_actions} target actions, or none"
         self._check(len(self.sources_by_action) in (0, n_actions), f"{right}, got {len(self.sources_by_action)}")
+        variables = checked_names("state_names", names.get("state_names", ()), n_variables, "s")
+        actions = checked_names("action_names", names.get("action_names", ()), n_actions, "a")
+        found = []
         for action, mapping in enumerate(by_action):
             source = sources[self.sources_by_action[action] if self.sources_by_action else 0]
             try:
+                if mapping.has_names:
+                    mapping = mapping.with_names(source.state_names, variables, source.action_names, actions)
+                found.append(mapping)
                 mapping.check(
                     n_source_variables=source.n_variables,
                     n_target_variables=n_variables,
@@ -168,6 +176,9 @@ class Pair:
                 )
             except ValueError as error:
                 raise ValueError(f"{self.name}: known_by_action: {error}") from error
+        # Where there are no names the pair stays as it is: runs in a folder are told by it.
+        named = any(mapping.has_names for mapping in by_action)
+        return replace(self, known_by_action=found[0] if one else tuple(found)) if named else self
 
     def agrees(self, mapped: MappedVariables) -> bool:
         """Whether what a method makes of a target action is what the known mapping makes of the variables that it moves."""

@@ -307,7 +307,7 @@ class TestPairArguments:
             ((FOUR,), (), "known_by_action must have one mapping for each of the 2 target actions, got 1"),
             (SAME, (), "known_by_action: state must have 4 entries"),
             (InterTaskMapping((0,) * 4, (0, 2)), (), "known_by_action: action must hold indices from 0 to 1"),
-            (InterTaskMapping({"x": "x"}, {"left": "left"}), (), "known_by_action: .* has names"),
+            (InterTaskMapping({"x": "s0"}, {"a0": "a0", "a1": "a1"}), (), "known_by_action: state must hold .*, got 'x'"),
         ],
     )
     def test_a_known_mapping_must_have_the_variables_and_actions_of_both_tasks(self, by_action, numbers, words):
@@ -321,6 +321,16 @@ class TestPairArguments:
         else:
             with pytest.raises(ValueError, match=f"^p: {words}"):
                 pair.check_known(source)
+
+    def test_names_in_a_known_mapping_become_numbers(self):
+        turned = InterTaskMapping({"s3": "s1", "s0": "s2"}, {"a0": "a1", "a1": "a0"}, {"s0": -1})
+        source = (random_instances("CartPole-v1", 20),)
+        for given in (turned, (turned, FOUR)):
+            pair = Pair("p", "", (recorded("s", "CartPole-v1"),), "CartPole-v1", n_episodes=1, known_by_action=given)
+            known = pair.check_known(source).known_by_action
+            first = known if given is turned else known[0]
+            assert first == InterTaskMapping((2, None, None, 1), (1, 0), (-1, 1, 1, 1))
+            assert given is turned or known[1] == FOUR
 
     def test_a_learner_that_does_not_exist(self):
         with pytest.raises(ValueError, match="learner must be one of fitted_rmax, q_learning, got 'sarsa'"):
