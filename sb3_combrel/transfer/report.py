@@ -78,7 +78,7 @@ class EvidencePoint:
     """What a source was worth at one time of learning, with ``use="prior"``; it holds until the next point."""
 
     step: int  #: steps of the target that were observed by then
-    error: float  #: mean squared error of the mapping in use over that of "no change", on the steps compared until then
+    error: float  #: mean squared error of the mapping in use over that of "no change", also where the source has no data
     exceeded: float  #: by how much returns had exceeded the source's values
     bounds_values: bool  #: whether the source's values bounded what is unknown
     strengths: tuple[float, ...]  #: by target action: as how many of the target's own instances the source counted
@@ -96,10 +96,11 @@ class TransferReport:
     #: Of these, steps whose action transferred instances predicted; None with ``use="prior"``.
     n_rested: int | None = None
     mappings: tuple[MappingReport, ...] = ()  #: one for each target action that was mapped
-    error: float = np.nan  #: prediction error of what was transferred, over all actions
+    #: Prediction error of what was transferred, over all actions; with ``use="prior"`` also where the source has no data.
+    error: float = np.nan
     next_best: str = ""  #: with a factored mapping, the next best division of the target's variables, by name
     next_best_error: float = np.nan
-    n_compared: int = 0  #: steps on which predictions of the source were compared with what happened
+    n_compared: int = 0  #: steps on which predictions of the source were compared with what happened, where it has data
     n_worse: int = 0  #: of these, steps on which they were worse than "no change"
     contradictions: tuple[Contradiction, ...] = ()  #: where they were worse on average, the worst first
     ends: tuple[int, int] = (0, 0)  #: episode ends where the source predicts them, and ends predicted or not, wrongly
@@ -131,9 +132,10 @@ class TransferReport:
             return "Nothing can be said of the source: none of its predictions has been compared with what happened."
         well = "well" if self.error < 0.5 else "in part" if self.error < 1.0 else "no better than that nothing changes"
         worse = 100 * self.n_worse / self.n_compared
-        judged = f"its prediction error is {_text(self.error)} (no change: 1), worse than no change on {worse:.0f} % of"
+        judged = f"its prediction error is {_text(self.error)} (no change: 1)"
+        where = f"where it has data it was worse than no change on {worse:.0f} % of {self.n_compared:,} steps"
         more = ", and its values bound those of what is unknown" if self.bounds_values else ""
-        return f"The source explains the target {well}: {judged} {self.n_compared:,} steps{more}."
+        return f"The source explains the target {well}: {judged}; {where}{more}."
 
     @property
     def says_nothing(self) -> bool:

@@ -64,6 +64,24 @@ def test_the_mapping_of_a_prior_is_named_with_compliances_and_errors_of_the_targ
     assert report.next_best_error > report.error
 
 
+def test_the_sentence_does_not_give_the_error_on_all_steps_as_that_on_the_steps_compared():
+    """With a source that has data of a half of the states alone, these are different steps."""
+    source = f.oscillator_source(200)
+    half = {name: getattr(source, name)[source.states[:, 0] > 0.5] for name in ("states", "actions", "rewards")}
+    half |= {name: getattr(source, name)[source.states[:, 0] > 0.5] for name in ("next_states", "terminated")}
+    mapping = f.copies_mapping(1)
+    transfer = bound(TIMBREL(dataclasses.replace(source, **half), mapping, use="prior"), 2, 3)
+    states, actions, effects = transitions = f.walk(mapping, 200)
+    report = shown(transfer, transitions).report()
+    predicted = transfer.prior(states, actions).effect
+    assert report.error == pytest.approx(((effects - predicted) ** 2).sum() / (effects**2).sum())
+    assert 0 < report.n_compared < 180 and report.error != pytest.approx(transfer.region_errors.error(), rel=0.1)
+    judged, compared = report.sentence.split("; ")
+    assert judged.endswith(f"its prediction error is {report.error:.2f} (no change: 1)")
+    assert compared.startswith("where it has data it was worse than no change on ")
+    assert f" of {report.n_compared:,} steps" in compared
+
+
 def test_of_another_chooser_the_next_best_is_another_mapping_and_every_transition_is_measured():
     """MASTER chooses once, by errors, after more transitions than others measure one by one."""
     transfer = bound(MASTER(f.oscillator_source(200), n_random_steps=530, use="prior"), 2, 3)
