@@ -199,16 +199,21 @@ def _follow(frame: pd.DataFrame) -> NDArray[np.bool_]:
     """Whether each row but the first was made right after the one above it: some may have been left out, by their index."""
     import pandas as pd
 
-    if frame.index.nlevels > 1 or not pd.api.types.is_integer_dtype(frame.index.dtype):
+    if frame.index.nlevels > 1 or pd.api.types.is_bool_dtype(frame.index.dtype):
         return np.ones(len(frame) - 1, dtype=np.bool_)
-    apart = np.diff(frame.index.to_numpy())
-    found, times = np.unique(apart, return_counts=True)
-    if len(apart) > 0 and (found[times.argmax()] < 1 or 2 * times.max() < len(apart)):
+    # Times as numbers; of text, no number.
+    places = np.asarray(pd.to_numeric(frame.index, errors="coerce"), dtype=np.float64)
+    if len(frame) < 2 or not np.isfinite(places).all():
+        return np.ones(len(frame) - 1, dtype=np.bool_)
+    apart = np.diff(places)
+    step = np.median(apart)
+    follows: NDArray[np.bool_] = (apart > 0.0) & (apart < 1.5 * step)
+    if 2 * follows.sum() < len(apart):
         raise ValueError(
             "the table's index must rise evenly where rows follow each other, as it does not: sort the rows, or, if they are "
             "in order, number them: table.reset_index(drop=True)"
         )
-    return apart == (found[times.argmax()] if len(apart) else 1)
+    return follows
 
 
 def _numbers(frame: pd.DataFrame, names: Sequence[str]) -> Floats:

@@ -205,6 +205,23 @@ def test_no_transition_leads_across_rows_that_were_left_out():
     assert effects(table.set_index(pd.Index(20 * np.arange(7)))) == [0.1] * 6
 
 
+@pytest.mark.parametrize(
+    "times",
+    [pd.date_range("2026-01-01", periods=7, freq="100ms", tz="CET"), pd.to_timedelta(np.arange(7), unit="s"), 0.1 * np.arange(7)],
+    ids=lambda times: str(times.dtype),
+)
+def test_times_as_index_say_as_much_as_whole_numbers(times):
+    table = log().set_index(pd.Index(times))
+    assert effects(table) == [0.1] * 6
+    assert effects(table.drop(index=times[[3, 4]])) == [0.1] * 3
+    with pytest.raises(ValueError, match="sort the rows"):
+        SourceInstances.from_table(table[::-1])
+    # Clocks are not exact; text is no time.
+    jitter = np.array([0.0, 0.2, -0.1, 0.1, -0.2, 0.1, 0.0]) * (times[1] - times[0])
+    assert effects(table.set_index(pd.Index(times + jitter))) == [0.1] * 6
+    assert effects(table.set_index(pd.Index(list("gfedcba")))) == [0.1] * 6
+
+
 def test_an_end_is_one_whatever_the_numbers_of_episodes_say():
     ends = [False] * 3 + [True] + [False] * 3
     assert effects(log(episode=0, truncated=ends)) == [0.1] * 5
