@@ -242,7 +242,8 @@ class SourceInstances:
         the step reached a terminal state (or ``done``, with ``truncated`` for time limits; without either no step did); and
         where the step led, ``next_`` and the name of each variable. Without these columns a step leads to the state of the
         next row, up to an end, and of the same ``episode`` if there is such a column. A last state of an episode is a row with
-        an empty ``action``. Where the table's index, numbers or times, says that rows were left out, no step leads across.
+        an empty ``action``. Where the table's index, numbers or times, says that rows were left out, no step leads across;
+        nor from one of its outer levels to another, ``pandas.concat({file: table, ...})``.
 
         :param table: path of a CSV file, or a pandas DataFrame
         :param state_names: columns that are state variables, in their order; None: all that are not one of those above

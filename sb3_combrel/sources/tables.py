@@ -199,16 +199,18 @@ def _follow(frame: pd.DataFrame) -> NDArray[np.bool_]:
     """Whether each row but the first was made right after the one above it: some may have been left out, by their index."""
     import pandas as pd
 
-    if frame.index.nlevels > 1 or pd.api.types.is_bool_dtype(frame.index.dtype):
-        return np.ones(len(frame) - 1, dtype=np.bool_)
+    index = frame.index
+    # Outer levels, as of files that were put together, are like episodes.
+    follows = np.ones(len(frame) - 1, dtype=np.bool_)
+    if index.nlevels > 1:
+        follows = np.asarray(index.droplevel(-1)[1:] == index.droplevel(-1)[:-1], dtype=np.bool_)
     # Times as numbers; of text, no number.
-    places = np.asarray(pd.to_numeric(frame.index, errors="coerce"), dtype=np.float64)
-    if len(frame) < 2 or not np.isfinite(places).all():
-        return np.ones(len(frame) - 1, dtype=np.bool_)
-    apart = np.diff(places)
-    step = np.median(apart)
-    follows: NDArray[np.bool_] = (apart > 0.0) & (apart < 1.5 * step)
-    if 2 * follows.sum() < len(apart):
+    places = np.asarray(pd.to_numeric(index.get_level_values(-1), errors="coerce"), dtype=np.float64)
+    if not follows.any() or not np.isfinite(places).all():
+        return follows
+    apart, n_together = np.diff(places), follows.sum()
+    follows &= (apart > 0.0) & (apart < 1.5 * np.median(apart[follows]))
+    if 2 * follows.sum() < n_together:
         raise ValueError(
             "the table's index must rise evenly where rows follow each other, as it does not: sort the rows, or, if they are "
             "in order, number them: table.reset_index(drop=True)"

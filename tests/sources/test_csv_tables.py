@@ -239,6 +239,13 @@ def test_episodes_may_be_an_index_and_every_row_needs_one():
         SourceInstances.from_table(log(episode=[0] + [None] * 6))
 
 
+def test_no_transition_leads_from_one_file_to_another():
+    one, other = log().drop(index=[3, 4]), log() + {"x": 5.0, "action": 0, "reward": 0.0}
+    assert effects(pd.concat({"monday.csv": one, "tuesday.csv": other})) == [0.1] * (3 + 6)
+    # The second begins with the number that would be next in the first.
+    assert effects(pd.concat({"monday.csv": log(), "tuesday.csv": other.set_index(other.index + 7)})) == [0.1] * 12
+
+
 @pytest.mark.parametrize("name", ["terminal", "Done", "is_last", "timeouts"])
 def test_a_column_that_seems_to_say_where_episodes_end_is_not_left_out_without_a_word(name):
     with pytest.raises(ValueError, match=f"has a column '{name}', and none of 'terminated'"):
