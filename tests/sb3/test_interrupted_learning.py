@@ -1,6 +1,7 @@
 """Learning that is interrupted, in mid-episode or at its end, saved or not, is learning that was not."""
 
 import copy
+import signal
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.env_checker import check_env
 
 from sb3_combrel import FittedRMax
+from sb3_combrel.common.instances import Instances
 
 
 def learned_the_same(one, other):
@@ -81,3 +83,22 @@ def test_a_checkpoint_of_a_running_episode_loads_and_learns_on(tmp_path):
 
 def test_the_task_of_these_tests_passes_the_check_of_stable_baselines3():
     check_env(Walk())
+
+
+def test_an_interrupt_waits_until_what_a_step_has_shown_is_learned(monkeypatch):
+    """Within, arrays would be of two sizes, and what comes next be written beyond the smaller ones."""
+    model, whole, enlarged = small(), small().learn(300), Instances.enlarged
+
+    def interrupted(instances, capacity):
+        signal.raise_signal(signal.SIGINT)
+        return enlarged(instances, capacity)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Instances, "enlarged", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            model.learn(300)
+    done = model.num_timesteps
+    assert 64 < done < 300 and model.agent.model.n_instances == done
+    np.testing.assert_array_equal(model.source_instances().states, whole.source_instances().states[:done])
+    model.learn(300 - done, reset_num_timesteps=False)
+    assert model.agent.model.n_instances == 300 and signal.getsignal(signal.SIGINT) is signal.default_int_handler
