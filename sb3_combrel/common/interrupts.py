@@ -1,4 +1,4 @@
-"""Interrupts from the keyboard, where what is half done would be of no use."""
+"""Interrupts from the keyboard while a model learns."""
 
 import signal
 import threading
@@ -7,17 +7,43 @@ from contextlib import contextmanager
 from typing import Any
 
 
-@contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Let an interrupt wait until all within is done; as a decorator, until the function is. Only the main thread has any."""
-    before, waiting = signal.getsignal(signal.SIGINT), list[Any]()
-    if not callable(before) or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    signal.signal(signal.SIGINT, lambda *given: waiting.append(given))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-        if waiting:
-            before(*waiting[0])
+class Interrupts:
+    """Lets an interrupt wait until what a step has shown is learned: half of it would leave arrays that do not fit each other.
+
+    A second interrupt does not wait. Only the main thread has any.
+    """
+
+    def __init__(self) -> None:
+        self._wait, self._waiting = False, list[Any]()
+
+    @contextmanager
+    def taken(self) -> Iterator[None]:
+        """While a model learns: take interrupts, and pass them on at once unless they are :meth:`held`."""
+        self._pass_on = signal.getsignal(signal.SIGINT)
+        if not callable(self._pass_on) or threading.current_thread() is not threading.main_thread():
+            yield
+            return
+
+        def take(*given: Any) -> None:
+            if self._wait and not self._waiting:
+                self._waiting.append(given)
+            else:
+                self._waiting.clear()
+                self._pass_on(*given)
+
+        signal.signal(signal.SIGINT, take)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, self._pass_on)
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Let an interrupt wait until all within is done."""
+        self._wait = True
+        try:
+            yield
+        finally:
+            self._wait = False
+            if self._waiting:
+                self._pass_on(*self._waiting.pop())

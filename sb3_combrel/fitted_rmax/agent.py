@@ -26,7 +26,6 @@ from sb3_combrel.common.constants import (
     SWEEPS_A_STEP,
     SWEEPS_AT_EPISODE_END,
 )
-from sb3_combrel.common.interrupts import uninterrupted
 from sb3_combrel.common.periodic import periodic_flags
 from sb3_combrel.common.scaling import StateScaling
 from sb3_combrel.common.task import Task
@@ -214,7 +213,6 @@ class FittedRMaxAgent:
         planner = self.planner
         return ValueFunction(planner.values, self.grid.plain, self.mdp.gamma, planner.bounds, planner.worth)
 
-    @uninterrupted()
     def update(
         self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool, environment: int = 0
     ) -> None:
@@ -241,7 +239,6 @@ class FittedRMaxAgent:
             self.promises.stays.clear()
             self._method.break_off()
 
-    @uninterrupted()
     def end_episode(self, truncated: bool, environment: int = 0) -> None:
         """Plan on while no action is due.
 

@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_combrel.common.attributes import names_of, periodic_of
 from sb3_combrel.common.checks import as_count, check_boolean, check_count
+from sb3_combrel.common.interrupts import Interrupts
 from sb3_combrel.common.observations import with_own_arrays
 from sb3_combrel.common.serialisation import to_plain
 from sb3_combrel.fitted_rmax.agent import FittedRMaxAgent
@@ -239,7 +240,7 @@ class FittedRMax(PastData):
         # What the user gave was a description: results are on the method in use. ``save`` writes a description again.
         self.transfer = self.policy.transfer
         self._episode_rewards: list[list[float]] = []
-        self._is_learning = False
+        self._is_learning, self._interrupts = False, Interrupts()
         self._progress = ProgressWatch(self.agent.rewards, self.planning_tolerance)
         # They are saved with what was learned from them.
         given, self.instances = self.instances, None
@@ -321,10 +322,9 @@ class FittedRMax(PastData):
         self.agent.prepare()
         self._is_learning = True
         try:
-            while self.num_timesteps < total_timesteps:
-                if not self._step(callback, log_interval):
-                    break
-                self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
+            with self._interrupts.taken():
+                while self.num_timesteps < total_timesteps and self._step(callback, log_interval):
+                    self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
         finally:
             self._is_learning = False
             callback.on_training_end()
@@ -365,10 +365,11 @@ class FittedRMax(PastData):
         ended = [e for e, done in enumerate(dones.tolist()) if done]
         next_obs, terminated = true_outcomes(new_obs, infos, ended)
         next_states = self.policy.to_unit(next_obs, note=True)
-        for e, choice in enumerate(choices):
-            self.agent.update(states[e], choice, raw_rewards[e], next_states[e], terminated[e], e)
-            self._episode_rewards[e].append(raw_rewards[e])
-        self._last_obs = new_obs  # type: ignore[assignment]
+        with self._interrupts.held():
+            for e, choice in enumerate(choices):
+                self.agent.update(states[e], choice, raw_rewards[e], next_states[e], terminated[e], e)
+                self._episode_rewards[e].append(raw_rewards[e])
+            self._last_obs = new_obs  # type: ignore[assignment]
         if ended:
             self.policy.to_unit(np.asarray(new_obs), note=True)
         self._last_episode_starts = dones
@@ -378,8 +379,9 @@ class FittedRMax(PastData):
         finally:
             # Also if a callback stops the learning at this step, or raises.
             before = self._episode_num
-            for e in ended:
-                self._end_episode(e, terminated[e])
+            with self._interrupts.held():
+                for e in ended:
+                    self._end_episode(e, terminated[e])
         self._progress.note_step(self.env)
         if ended:
             logs = log_interval is not None and self._episode_num // log_interval > before // log_interval

@@ -11,6 +11,7 @@ from stable_baselines3.common.env_checker import check_env
 
 from sb3_combrel import FittedRMax
 from sb3_combrel.common.instances import Instances
+from sb3_combrel.common.interrupts import Interrupts
 
 
 def learned_the_same(one, other):
@@ -102,3 +103,12 @@ def test_an_interrupt_waits_until_what_a_step_has_shown_is_learned(monkeypatch):
     np.testing.assert_array_equal(model.source_instances().states, whole.source_instances().states[:done])
     model.learn(300 - done, reset_num_timesteps=False)
     assert model.agent.model.n_instances == 300 and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_second_interrupt_does_not_wait():
+    interrupts, done = Interrupts(), []
+    with pytest.raises(KeyboardInterrupt), interrupts.taken(), interrupts.held():
+        for number in range(3):
+            done.append(number)
+            signal.raise_signal(signal.SIGINT)
+    assert done == [0, 1] and signal.getsignal(signal.SIGINT) is signal.default_int_handler
