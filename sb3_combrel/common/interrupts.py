@@ -15,6 +15,7 @@ class Interrupts:
 
     def __init__(self) -> None:
         self._wait, self._waiting = False, list[Any]()
+        self._pass_on: Any = None
 
     @contextmanager
     def taken(self) -> Iterator[None]:
