@@ -8,7 +8,7 @@ from typing import Any
 
 
 class Interrupts:
-    """Lets an interrupt wait until what a step has shown is learned: half of it would leave arrays that do not fit each other.
+    """As a context, lets an interrupt wait until all within is done: half a step would leave arrays that do not fit each other.
 
     A second interrupt does not wait. Only the main thread has any.
     """
@@ -19,32 +19,28 @@ class Interrupts:
 
     @contextmanager
     def taken(self) -> Iterator[None]:
-        """While a model learns: take interrupts, and pass them on at once unless they are :meth:`held`."""
+        """Take interrupts, which are passed on at once unless they are to wait: while a model learns."""
         self._pass_on = signal.getsignal(signal.SIGINT)
         if not callable(self._pass_on) or threading.current_thread() is not threading.main_thread():
             yield
             return
-
-        def take(*given: Any) -> None:
-            if self._wait and not self._waiting:
-                self._waiting.append(given)
-            else:
-                self._waiting.clear()
-                self._pass_on(*given)
-
-        signal.signal(signal.SIGINT, take)
+        signal.signal(signal.SIGINT, self._take)
         try:
             yield
         finally:
             signal.signal(signal.SIGINT, self._pass_on)
 
-    @contextmanager
-    def held(self) -> Iterator[None]:
-        """Let an interrupt wait until all within is done."""
+    def _take(self, *given: Any) -> None:
+        if self._wait and not self._waiting:
+            self._waiting.append(given)
+        else:
+            self._waiting.clear()
+            self._pass_on(*given)
+
+    def __enter__(self) -> None:
         self._wait = True
-        try:
-            yield
-        finally:
-            self._wait = False
-            if self._waiting:
-                self._pass_on(*self._waiting.pop())
+
+    def __exit__(self, *_: object) -> None:
+        self._wait = False
+        if self._waiting:
+            self._pass_on(*self._waiting.pop())

@@ -240,7 +240,9 @@ class FittedRMax(PastData):
         # What the user gave was a description: results are on the method in use. ``save`` writes a description again.
         self.transfer = self.policy.transfer
         self._episode_rewards: list[list[float]] = []
-        self._is_learning, self._interrupts = False, Interrupts()
+        #: Unit coordinates of the last observations while it learns, shape (n_envs, n_variables).
+        self._last_states: np.ndarray | None = None
+        self._interrupts = Interrupts()
         self._progress = ProgressWatch(self.agent.rewards, self.planning_tolerance)
         # They are saved with what was learned from them.
         given, self.instances = self.instances, None
@@ -316,17 +318,16 @@ class FittedRMax(PastData):
         callback.on_training_start(locals(), globals())
         callback.on_rollout_start()
         self._episode_rewards = [[] for _ in range(self.n_envs)]
-        self.policy.to_unit(np.asarray(self._last_obs), note=True)
+        self._last_states = self.policy.to_unit(np.asarray(self._last_obs), note=True)
         if begins_anew:
             self.agent.break_off()
         self.agent.prepare()
-        self._is_learning = True
         try:
             with self._interrupts.taken():
                 while self.num_timesteps < total_timesteps and self._step(callback, log_interval):
                     self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
         finally:
-            self._is_learning = False
+            self._last_states = None
             callback.on_training_end()
         self.policy.scales.warn_of_share(self.agent.task.state_names)
         return self
@@ -352,8 +353,8 @@ class FittedRMax(PastData):
 
     def _step(self, callback: BaseCallback, log_interval: int | None) -> bool:
         """Make one step of every environment; return False if a callback stops the learning."""
-        assert self.env is not None
-        states = self.policy.to_unit(np.asarray(self._last_obs))
+        assert self.env is not None and self._last_states is not None
+        states = self._last_states
         choices = [self.agent.act(state, environment=e) for e, state in enumerate(states)]
         actions = np.array(choices) + self.policy._first_action
         # An interrupt, or a simulator's error: where the environment is now nobody knows. The next ``learn`` resets it.
@@ -365,13 +366,12 @@ class FittedRMax(PastData):
         ended = [e for e, done in enumerate(dones.tolist()) if done]
         next_obs, terminated = true_outcomes(new_obs, infos, ended)
         next_states = self.policy.to_unit(next_obs, note=True)
-        with self._interrupts.held():
+        with self._interrupts:
             for e, choice in enumerate(choices):
                 self.agent.update(states[e], choice, raw_rewards[e], next_states[e], terminated[e], e)
                 self._episode_rewards[e].append(raw_rewards[e])
             self._last_obs = new_obs  # type: ignore[assignment]
-        if ended:
-            self.policy.to_unit(np.asarray(new_obs), note=True)
+            self._last_states = self.policy.to_unit(np.asarray(new_obs), note=True) if ended else next_states
         self._last_episode_starts = dones
         callback.update_locals(locals())
         try:
@@ -379,7 +379,7 @@ class FittedRMax(PastData):
         finally:
             # Also if a callback stops the learning at this step, or raises.
             before = self._episode_num
-            with self._interrupts.held():
+            with self._interrupts:
                 for e in ended:
                     self._end_episode(e, terminated[e])
         self._progress.note_step(self.env)
@@ -390,7 +390,8 @@ class FittedRMax(PastData):
             if logs:
                 self.dump_logs()
             callback.on_rollout_start()
-        self.policy.follow_scales(episode_ended=bool(ended))
+        if self.policy.follow_scales(episode_ended=bool(ended)):
+            self._last_states = self.policy.to_unit(np.asarray(new_obs))
         return going_on
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:

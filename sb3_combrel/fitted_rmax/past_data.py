@@ -27,7 +27,7 @@ class PastData(SavedAlgorithm):
     """What :class:`~sb3_combrel.FittedRMax` does with experience that it has not made itself."""
 
     env: VecEnv | None
-    _is_learning: bool
+    _last_states: np.ndarray | None
     _progress: ProgressWatch
 
     def load_instances(self, instances: Any, n_instances: int = 1000) -> Self:
@@ -50,6 +50,9 @@ class PastData(SavedAlgorithm):
         past = self._of_this_task(self._read_instances(instances, n_instances))
         self.policy.take_in(past)
         self._progress.note_ends(past.rewards[past.terminated])
+        if self._last_states is not None:
+            # A callback has called this: scales may be other ones now.
+            self._last_states = self.policy.to_unit(np.asarray(self._last_obs))
         return self
 
     def source_instances(self) -> SourceInstances:
@@ -93,7 +96,7 @@ class PastData(SavedAlgorithm):
     def _act(self, controller: Callable[[np.ndarray], int] | Any, n_instances: int) -> SourceInstances:
         if self.env is None:
             raise ValueError("instances must be data where the model has no environment to act in: call set_env(env) first")
-        if self._is_learning:
+        if self._last_states is not None:
             raise ValueError(
                 "instances must be data while the model learns, as its environment is in use: record a controller in another, "
                 "load_instances(SourceInstances.record(controller, env, n_instances))"

@@ -78,10 +78,10 @@ class FittedRMaxPolicy(BasePolicy):
             self._replace_learned(before)
             raise
 
-    def follow_scales(self, episode_ended: bool) -> None:
-        """Compute all anew in other unit coordinates if the observations so far ask for that."""
+    def follow_scales(self, episode_ended: bool) -> bool:
+        """Compute all anew in other unit coordinates if the observations so far ask for that; whether they do."""
         if self.scales.fixed or not (episode_ended or self.scales.went_beyond):
-            return
+            return False
         # No other thread may see new scales with old instances.
         with self.agent.lock:
             before, scaling = self.scales.scaling, self.scales.renewed(episode_ended, self.agent.transfers)
@@ -92,6 +92,7 @@ class FittedRMaxPolicy(BasePolicy):
                 except BaseException:
                     self.scales.scaling = self.agent.task.scaling
                     raise
+        return scaling is not None
 
     @property
     def transfer(self) -> Any:

@@ -172,7 +172,8 @@ class SavedAlgorithm(BaseAlgorithm):
             raise ParametersError(f"load_path_or_dict: {' '.join(str(error).split())}") from error
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_rng", "_episode_rewards", "_is_learning", "_interrupts", "_progress"]
+        own = ["_rng", "_episode_rewards", "_last_states", "_interrupts", "_progress"]
+        return [*super()._excluded_save_params(), *own]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy"], []

@@ -107,7 +107,7 @@ def test_an_interrupt_waits_until_what_a_step_has_shown_is_learned(monkeypatch):
 
 def test_a_second_interrupt_does_not_wait():
     interrupts, done = Interrupts(), []
-    with pytest.raises(KeyboardInterrupt), interrupts.taken(), interrupts.held():
+    with pytest.raises(KeyboardInterrupt), interrupts.taken(), interrupts:
         for number in range(3):
             done.append(number)
             signal.raise_signal(signal.SIGINT)
