@@ -8,7 +8,7 @@ from typing import Any
 
 
 class Interrupts:
-    """As a context, lets an interrupt wait until all within is done: half a step would leave arrays that do not fit each other.
+    """As a context, lets an interrupt wait until all within is done: half a step would leave arrays that do not fit.
 
     A second interrupt does not wait. Only the main thread has any.
     """
