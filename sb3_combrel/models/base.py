@@ -160,12 +160,13 @@ class Model(ABC):
 
     def _make_room(self, capacity: int) -> None:
         """Make room for at least so many instances of each action."""
-        self.instances = self.instances.enlarged(capacity)
-        self._number = np.pad(self._number, ((0, 0), (0, self.instances.capacity - self._number.shape[1])))
-        self._take_in_arrays()
+        instances = self.instances.enlarged(capacity)
+        self._number = np.pad(self._number, ((0, 0), (0, instances.capacity - self._number.shape[1])))
+        self._take_in_arrays(instances)
 
-    def _take_in_arrays(self) -> None:  # noqa: B027 - most have nothing to do
-        """Take in that the instances are in other arrays."""
+    def _take_in_arrays(self, instances: Instances) -> None:
+        """Have the instances in other arrays."""
+        self.instances = instances
 
     def update_rows(self, pairs: np.ndarray) -> None:
         """Bring the rows of at most ``MAX_PAIRS_AT_ONCE`` pairs up to date with the instances and with what is transferred."""
@@ -205,8 +206,8 @@ class Model(ABC):
         return model
 
     def _share_instances(self, other: Model) -> None:
-        self.instances, self._number, self.n_added = other.instances, other._number, other.n_added
-        self._take_in_arrays()
+        self._number, self.n_added = other._number, other.n_added
+        self._take_in_arrays(other.instances)
 
     def predict_alone(self, state: np.ndarray, action: int) -> tuple[np.ndarray, float]:
         """Predict the effect of an action at a state without a prior.
@@ -235,13 +236,13 @@ class Model(ABC):
 
     def _put_in_order(self, rows: np.ndarray) -> None:
         """Put instances where they were: sums over all of them depend on their order, in the last bit."""
-        self.instances = Instances.from_rows(self.n_actions, rows[:, :-1], self.grid.arrays.periodic)
+        instances = Instances.from_rows(self.n_actions, rows[:, :-1], self.grid.arrays.periodic)
         by_action = np.argsort(rows[:, 0], kind="stable")
-        numbers = np.split(rows[by_action, -1].astype(np.int64), np.cumsum(self.instances.size)[:-1])
-        self._number = np.zeros((self.n_actions, self.instances.capacity), dtype=np.int64)
+        numbers = np.split(rows[by_action, -1].astype(np.int64), np.cumsum(instances.size)[:-1])
+        self._number = np.zeros((self.n_actions, instances.capacity), dtype=np.int64)
         for action, own in enumerate(numbers):
             self._number[action, : len(own)] = own
-        self._take_in_arrays()
+        self._take_in_arrays(instances)
 
     def update_all(self, pairs: np.ndarray) -> None:
         """:meth:`update_rows` of any number of pairs."""

@@ -103,7 +103,7 @@ class GridModel(Model):
         self._prediction = Prediction.empty(self.n_actions, self._own_room, self.grid.n_variables)
         # To as many pairs as are ever written at once.
         self._nothing = tuple(TransferredInstances.empty(MAX_PAIRS_AT_ONCE, self.grid.n_variables))
-        self._take_in_arrays()
+        self._take_in_arrays(self.instances)
 
     @property
     def _giver(self) -> InstanceTransfer | None:
@@ -128,21 +128,22 @@ class GridModel(Model):
     def _write_rows(self, pairs: tuple[np.ndarray, int], transferred: tuple[Any, ...]) -> int:
         """Fit, and write the rows of, (pairs, how many are done); how many are done then, fewer if there is no room."""
 
-    def _take_in_arrays(self) -> None:
+    def _take_in_arrays(self, instances: Instances) -> None:
         """Make the arrivals, which share arrays with the instances, and those among them that ended an episode."""
-        instances = self.instances
         arrivals = Instances.empty(self.n_actions, self.grid.n_variables, instances.capacity)
         shared = {name: getattr(instances, name) for name in ("reward", "terminated", "size", "periodic")}
-        self.arrivals = arrivals._replace(**shared)
-        put_arrivals.call(instances, self.arrivals)
-        self._renew_ends()
+        arrivals = arrivals._replace(**shared)
+        put_arrivals.call(instances, arrivals)
+        self._renew_ends(instances, arrivals)
 
-    def _renew_ends(self) -> None:
-        arrivals, ended = self.arrivals, [np.empty((0, self.grid.n_variables))]
+    def _renew_ends(self, instances: Instances, arrivals: Instances) -> None:
+        ended = [np.empty((0, self.grid.n_variables))]
         if not self.settings.ends_by_action:
             ended += [arrivals.state[a, :n][arrivals.terminated[a, :n]] for a, n in enumerate(arrivals.size)]
-        self.ends = Ends(np.concatenate(ended), np.zeros(2, dtype=np.int64))
-        self._plain_experience = tuple(self.instances), tuple(self.arrivals), tuple(self.ends)
+        ends = Ends(np.concatenate(ended), np.zeros(2, dtype=np.int64))
+        plain = tuple(instances), tuple(arrivals), tuple(ends)
+        # At once, without a call in between: with some of them an interrupt would leave others that are too small.
+        self.instances, self.arrivals, self.ends, self._plain_experience = instances, arrivals, ends, plain
 
     def add(self, state: np.ndarray, action: int, reward: float, next_state: np.ndarray, terminated: bool) -> np.ndarray:
         slot, removed = self._slot_for(state, action)
@@ -161,7 +162,7 @@ class GridModel(Model):
             due = self._inform(float(transition[4]), bool(terminated), due)
         if not terminated or self.settings.ends_by_action:
             return due
-        self._renew_ends()
+        self._renew_ends(self.instances, self.arrivals)
         # What is known of ends concerns all actions that may lead there.
         arrived, noted = self.arrivals.state[action, slot], [due]
         widest = (self.grid.diagonal + float(np.linalg.norm(self.instances.effect[action, slot]))) ** 2
@@ -210,7 +211,7 @@ class GridModel(Model):
             removed = self._note(instance, action, self.kernel.reach, WENT)
             if instances.terminated[action, slot]:
                 instances.terminated[action, slot] = False
-                self._renew_ends()
+                self._renew_ends(self.instances, self.arrivals)
                 # Rows that have an end in them, of whatever action.
                 removed = np.union1d(removed, np.flatnonzero(np.isinf(self.pairs.surprise)))
             return slot, removed

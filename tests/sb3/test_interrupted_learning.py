@@ -12,6 +12,7 @@ from stable_baselines3.common.env_checker import check_env
 from sb3_combrel import FittedRMax
 from sb3_combrel.common.instances import Instances
 from sb3_combrel.common.interrupts import Interrupts
+from sb3_combrel.models import grid_model
 
 
 def learned_the_same(one, other):
@@ -112,6 +113,24 @@ def test_an_interrupt_waits_until_what_a_step_has_shown_is_learned(monkeypatch):
     np.testing.assert_array_equal(model.source_instances().states, whole.source_instances().states[:done])
     model.learn(300 - done, reset_num_timesteps=False)
     assert model.agent.model.n_instances == 300
+
+
+def test_an_interrupt_while_room_is_made_leaves_arrays_that_fit_each_other(monkeypatch):
+    """Also where nothing lets it wait, in an agent without Stable-Baselines3."""
+    model, whole = (small().learn(60).agent.model for _ in range(2))
+    steps = [transition for transition in model.transitions() if transition[1] == 0] * 5
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(grid_model, "Ends", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            model._make_room(model.instances.capacity + 1)
+    assert model.instances.capacity == model.arrivals.capacity == whole.instances.capacity
+    for step in steps:
+        np.testing.assert_array_equal(model.add(*step), whole.add(*step))
+    assert model.instances.capacity > len(steps)
 
 
 @pytest.mark.usefixtures("interruptible")
