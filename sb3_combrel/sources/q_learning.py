@@ -134,7 +134,8 @@ class QLearning:
             action = int(self._rng.integers(self.n_actions)) if (self._rng.random() < self.epsilon) else greedy
             if values[action] < values[greedy]:
                 # What follows an exploratory action is no evidence on the greedy policy from the states before it.
-                traces[visited], visited = 0.0, visited[:0]
+                traces[visited] = 0.0
+                visited = visited[:0]
             following, given, terminated, truncated, _ = self.env.step(action + self._first_action)
             when = f"in step {step} of episode {len(self.episode_lengths) + 1}"
             check_observation(following, when)
@@ -147,7 +148,8 @@ class QLearning:
             if not math.isfinite(error):
                 raise ValueError(f"the Q-values overflow {when}, at the reward {reward:g}: scale the rewards down")
             traces[visited] *= self.gamma * self.trace_decay
-            traces[tiles], traces[tiles, action] = 0.0, 1.0
+            traces[tiles] = 0.0
+            traces[tiles, action] = 1.0
             visited = np.union1d(visited, tiles)
             self.weights[visited] += (self.learning_rate / self.coding.n_tilings * error) * traces[visited]
             state, tiles = following, next_tiles
