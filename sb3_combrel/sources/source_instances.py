@@ -257,7 +257,10 @@ class SourceInstances:
         return cls(*tables.read_table(table, state_names, action_names, n_actions, bounds, periodic))
 
     def to_table(self) -> pd.DataFrame:
-        """The instances as a pandas DataFrame that :meth:`from_table` reads; ``.to_csv(path, index=False)`` writes it."""
+        """The instances as a pandas DataFrame that :meth:`from_table` reads; ``.to_csv(path, index=False)`` writes it.
+
+        It says nothing of the actions' names, the bounds and which variables are angles: :meth:`from_table` is told them again.
+        """
         return tables.as_frame(self)
 
     def to_minari(self, dataset_id: str, **metadata: Any) -> MinariDataset:
