@@ -206,6 +206,11 @@ def _follow(frame: pd.DataFrame) -> NDArray[np.bool_]:
         follows = np.asarray(index.droplevel(-1)[1:] == index.droplevel(-1)[:-1], dtype=np.bool_)
     # Times as numbers; of text, no number.
     places = np.asarray(pd.to_numeric(index.get_level_values(-1), errors="coerce"), dtype=np.float64)
+    if index.nlevels > 1 and not np.isfinite(places).all():
+        raise ValueError(
+            "the last level of the table's index must be numbers or times, which say which rows follow each other, got "
+            f"{index.get_level_values(-1)[0]!r}: pandas.to_datetime makes times of text"
+        )
     if not follows.any() or not np.isfinite(places).all():
         return follows
     apart, n_together = np.diff(places), follows.sum()

@@ -246,6 +246,13 @@ def test_no_transition_leads_from_one_file_to_another():
     assert effects(pd.concat({"monday.csv": log(), "tuesday.csv": other.set_index(other.index + 7)})) == [0.1] * 12
 
 
+def test_an_index_of_several_levels_ends_with_numbers_or_times():
+    """Two robots' rows in turn: which row is next of the same robot is not to be seen."""
+    turns = pd.MultiIndex.from_product([["10:00", "10:01", "10:02"], ["left robot", "right robot"]])
+    with pytest.raises(ValueError, match="last level of the table's index must be numbers or times, .* got 'left robot'"):
+        SourceInstances.from_table(log().iloc[:6].set_index(turns))
+
+
 @pytest.mark.parametrize("name", ["terminal", "Done", "is_last", "timeouts"])
 def test_a_column_that_seems_to_say_where_episodes_end_is_not_left_out_without_a_word(name):
     with pytest.raises(ValueError, match=f"has a column '{name}', and none of 'terminated'"):
