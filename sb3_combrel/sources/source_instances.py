@@ -259,7 +259,7 @@ class SourceInstances:
     def to_table(self) -> pd.DataFrame:
         """The instances as a pandas DataFrame that :meth:`from_table` reads; ``.to_csv(path, index=False)`` writes it.
 
-        It says nothing of the actions' names, the bounds and which variables are angles: :meth:`from_table` is told them again.
+        Names of actions, bounds and which variables are angles are not in it: :meth:`from_table` is told them again.
         """
         return tables.as_frame(self)
 

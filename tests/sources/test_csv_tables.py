@@ -249,7 +249,7 @@ def test_no_transition_leads_from_one_file_to_another():
 def test_an_index_of_several_levels_ends_with_numbers_or_times():
     """Two robots' rows in turn: which row is next of the same robot is not to be seen."""
     turns = pd.MultiIndex.from_product([["10:00", "10:01", "10:02"], ["left robot", "right robot"]])
-    with pytest.raises(ValueError, match="last level of the table's index must be numbers or times, .* got 'left robot'"):
+    with pytest.raises(ValueError, match=r"must be numbers or times, which .* got 'left robot'"):
         SourceInstances.from_table(log().iloc[:6].set_index(turns))
 
 
