@@ -23,16 +23,15 @@ KEPT = 0.5
 SWEEPS_A_STEP, SWEEPS_AT_EPISODE_END = 2, 300
 # Lowest return that a state is given, in steps of the worst reward seen, far below every sensible plan: all rows.
 LONGEST_PLAN = 10_000
-# The discount where one is needed and none is given, as in Stable-Baselines3; and what is unknown is worth as long as all
-# rewards were 0, any value above that: CartPole, MountainCarContinuous, dm_control's pendulum.
-DISCOUNT, WORTH_TRYING = 0.99, 1.0
+# The discount where one is needed and none is given, as in Stable-Baselines3: CartPole, MountainCarContinuous, dm_control's
+# pendulum.
+DISCOUNT = 0.99
 # Scales that are found: what an observation may lie beyond them by, in parts of the range; and a range that is more times as
 # wide as what is observed is too wide: CartPole, Acrobot, dm_control's pendulum.
 BEYOND, TOO_WIDE = 0.05, 2.0
-# Where a task goes on for ever, the lines of a grid of so many cells of a variable, or fewer, are where its values are wrong.
-# Whenever instances are so many times as many, lines go this part of the way there; of their density this part is even, and
-# errors are counted in so many bins of an even cell: dm_control's cart-pole.
-COARSE, LINES_AGAIN, LINE_STEP, EVENLY, BINS_A_CELL = 8, 1.1, 0.25, 0.1, 4
+# Where a task goes on for ever, the lines of a grid of so many cells of a variable, or fewer, are where its values are wrong,
+# and go half of the way there whenever instances are so many times as many: dm_control's cart-pole.
+COARSE, LINES_AGAIN = 8, 1.25
 # The action decides how episodes end, or where it leads does again, once it has foretold ends better by so many standard
 # errors, far more than chance makes: bandits, selling.
 SURE_OF_ENDS = 4.0

@@ -452,7 +452,7 @@ class FittedRMaxAgent:
         return self.is_coarse and self.rewards.for_ever
 
     def _move_lines(self) -> None:
-        """Move the lines of a coarse grid to where values between them are wrong, whenever experience has grown by a tenth.
+        """Move the lines of a coarse grid to where values between them are wrong, whenever experience has grown by a quarter.
 
         That is by how much a value interpolated at a state differs from the best action's there; the latter half of the
         experience counts. Where there is an end to come to, lines stay: no place is for staying.

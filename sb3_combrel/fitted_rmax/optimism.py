@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sb3_combrel.common.constants import DISCOUNT, WORTH_TRYING
+from sb3_combrel.common.constants import DISCOUNT
 
 LARGEST = float(np.finfo(np.float64).max)
 
@@ -66,7 +66,8 @@ class RewardRange:
         if self.largest == 0.0 and self.largest_end <= 0.0:
             # What costs nothing would keep the agent from what is unknown: nothing that it can pay is too much for that.
             discount = self.gamma if self.gamma < 1.0 else DISCOUNT
-            return -self.lowest / (1.0 - discount) if self.lowest < 0.0 else WORTH_TRYING
+            # As long as all rewards were 0, any value above that is the same.
+            return -self.lowest / (1.0 - discount) if self.lowest < 0.0 else 1.0
         for_ever = self.largest / (1.0 - self.gamma) if self.largest > 0.0 and self.gamma < 1.0 else 0.0
         return max(0.0, self.largest_end, for_ever)
 

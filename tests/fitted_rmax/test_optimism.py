@@ -6,7 +6,7 @@ from helpers.agents import make_agent
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sb3_combrel.fitted_rmax.optimism import DISCOUNT, WORTH_TRYING, RewardRange
+from sb3_combrel.fitted_rmax.optimism import DISCOUNT, RewardRange
 
 SIZES = st.floats(1e-3, 1e3)
 REWARDS = st.floats(-1e3, 1e3)
@@ -49,7 +49,7 @@ def test_where_the_most_is_nothing_the_unknown_is_worth_what_the_worst_costs_for
     rewards = after([(0.0, False), *((-cost, False) for cost in costs), *((end, True) for end in ends)])
     worst = max([*costs, *(-end for end in ends), 0.0])
     assert rewards.gamma == DISCOUNT
-    assert rewards.max_value == pytest.approx(worst / (1.0 - DISCOUNT) if worst > 0.0 else WORTH_TRYING)
+    assert rewards.max_value == pytest.approx(worst / (1.0 - DISCOUNT) if worst > 0.0 else 1.0)
     assert rewards.max_value > 0.0, "more than what costs nothing, or nothing would draw the agent on"
     undiscounted = after([(0.0, False), *((-cost, False) for cost in costs), *((end, True) for end in ends)], gamma=1.0)
     assert undiscounted.max_value == rewards.max_value
