@@ -19,7 +19,7 @@ MAX_MODEL_STEPS = 50
 # Of an agent that has stayed in a cell for so many steps: the part of what they have cost that its value must have risen by.
 # In between all and nothing: point robot without noise, MountainCar4D with a source of 3,000 instances.
 KEPT = 0.5
-# Full sweeps over the grid after each step, and at an episode's end: MountainCar4D, speed.
+# Full sweeps over the grid after each step, and at an episode's end, or of a source: MountainCar4D, speed.
 SWEEPS_A_STEP, SWEEPS_AT_EPISODE_END = 2, 300
 # Lowest return that a state is given, in steps of the worst reward seen, far below every sensible plan: all rows.
 LONGEST_PLAN = 10_000

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from sb3_combrel.common.constants import MAX_MODEL_STEPS, SWEEPS_AT_EPISODE_END
 from sb3_combrel.planning.grid import fitting_grid
 from sb3_combrel.planning.mdp import FiniteMDP
 from sb3_combrel.planning.planner import Planner
@@ -13,10 +14,6 @@ from sb3_combrel.transfer.candidates import stacked_instances
 from sb3_combrel.transfer.source_model import SourceModel
 
 MIN_WEIGHT = 1.0  # weight of instances from which on a prediction counts, as by default in Fitted R-Max
-# An action is held until its cell of the grid is left, but for no more than so many steps: values that are interpolated at
-# every step would spread over the grid.
-MAX_STEPS = 50
-MAX_SWEEPS = 300
 # What the grid's resolution is chosen for: the least weight of an instance that reaches a grid point.
 LEAST_WEIGHT_ON_GRID = 0.05
 _TOLERANCE = 0.001  # changes of value up to this part of the range of a step's rewards end the planning
@@ -39,7 +36,8 @@ def plan_source(
     # The probability that the episode goes on, discounted for all steps but one, which the MDP discounts itself.
     goes_on = np.ones(len(states))
     going = np.arange(len(states))
-    for step in range(MAX_STEPS):
+    # As the learner's: values that are interpolated at every step would spread over the grid.
+    for step in range(MAX_MODEL_STEPS):
         goes_on[going] *= 1.0 if step == 0 else mdp.gamma
         found = model.predict(at[going], actions[going])
         reward[going] += goes_on[going] * found.reward
@@ -67,7 +65,7 @@ class SourcePolicy:
         lowest, highest = float(source.rewards.min()), float(source.rewards.max())
         bounds = min(0.0, lowest) / (1.0 - gamma), max(0.0, highest) / (1.0 - gamma)
         self.model, planner = plan_source(source, gamma, breadth, MIN_WEIGHT, bounds)
-        self.values = planner.cautious_values(MAX_SWEEPS)  #: value of each grid point
+        self.values = planner.cautious_values(SWEEPS_AT_EPISODE_END)  #: value of each grid point
         self.grid = planner.mdp.grid
         n, d = source.n_actions, source.n_variables
         self._function = ValueFunction(self.values, self.grid.plain, float(gamma), bounds, planner.upper)

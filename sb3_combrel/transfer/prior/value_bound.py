@@ -6,12 +6,13 @@ import dataclasses
 
 import numpy as np
 
+from sb3_combrel.common.constants import MAX_MODEL_STEPS, SWEEPS_AT_EPISODE_END
 from sb3_combrel.planning.planner import Planner
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.base import TargetTask
 from sb3_combrel.transfer.prior.copies import Copies, distinct_rows
 from sb3_combrel.transfer.prior.prior_choice import Choice
-from sb3_combrel.transfer.source_policy import MAX_STEPS, MAX_SWEEPS, plan_source
+from sb3_combrel.transfer.source_policy import plan_source
 
 #: States, rewards and effects.
 Episode = list[tuple[np.ndarray, float, np.ndarray]]
@@ -96,7 +97,7 @@ class ValueBound:
         source = dataclasses.replace(source, actions=actions, n_actions=len(taken), action_names=())
         gamma, max_value = self._task.gamma, self._task.max_value
         # Lower than so many sweeps can get.
-        lowest = min(0.0, max_value) + (MAX_SWEEPS + 1) * MAX_STEPS * min(0.0, float(source.rewards.min())) - 1.0
+        lowest = min(0.0, max_value) + (SWEEPS_AT_EPISODE_END + 1) * MAX_MODEL_STEPS * min(0.0, float(source.rewards.min())) - 1.0
         _, planner = plan_source(source, gamma, self._copies.breadth, LEAST_WEIGHT, (lowest, max_value))
-        planner.sweep(MAX_SWEEPS)
+        planner.sweep(SWEEPS_AT_EPISODE_END)
         return planner
