@@ -97,7 +97,8 @@ class ValueBound:
         source = dataclasses.replace(source, actions=actions, n_actions=len(taken), action_names=())
         gamma, max_value = self._task.gamma, self._task.max_value
         # Lower than so many sweeps can get.
-        lowest = min(0.0, max_value) + (SWEEPS_AT_EPISODE_END + 1) * MAX_MODEL_STEPS * min(0.0, float(source.rewards.min())) - 1.0
+        n_steps = (SWEEPS_AT_EPISODE_END + 1) * MAX_MODEL_STEPS
+        lowest = min(0.0, max_value) + n_steps * min(0.0, float(source.rewards.min())) - 1.0
         _, planner = plan_source(source, gamma, self._copies.breadth, LEAST_WEIGHT, (lowest, max_value))
         planner.sweep(SWEEPS_AT_EPISODE_END)
         return planner
