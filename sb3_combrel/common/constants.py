@@ -4,8 +4,6 @@ What a user may choose is an argument of :class:`~sb3_combrel.FittedRMax`, with 
 Tolerances of arithmetic stand where they are used.
 """
 
-# The kernel of a fit is so broad that the farthest of its instances weighs this: MountainCar-v0, all local linear rows.
-LAST_WEIGHT = 0.05
 # On the slopes of a fit, in weights of instances a breadth away: MountainCar4D, Acrobot.
 RIDGE = 0.001
 # A pair of the grid is fitted anew when new instances may have changed its prediction by this part of the mean effect of its
@@ -23,9 +21,6 @@ KEPT = 0.5
 SWEEPS_A_STEP, SWEEPS_AT_EPISODE_END = 2, 300
 # Lowest return that a state is given, in steps of the worst reward seen, far below every sensible plan: all rows.
 LONGEST_PLAN = 10_000
-# The discount where one is needed and none is given, as in Stable-Baselines3: CartPole, MountainCarContinuous, dm_control's
-# pendulum.
-DISCOUNT = 0.99
 # Scales that are found: what an observation may lie beyond them by, in parts of the range; and a range that is more times as
 # wide as what is observed is too wide: CartPole, Acrobot, dm_control's pendulum.
 BEYOND, TOO_WIDE = 0.05, 2.0

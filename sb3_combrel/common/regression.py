@@ -3,7 +3,8 @@
 The one fit of the package: grid pairs, exact states and sources use it. With z = (x - at) / breadth, the numbers y of an
 instance at x (its effect, its reward, and perhaps whether it ended an episode) are modelled as y = mean + slopes^T z by
 weighted least squares with a ridge on the slopes (Atkeson, Moore & Schaal 1997, "Locally weighted learning", Section 4.2). The
-kernel is as broad as makes the last of ``n_neighbors`` instances weigh 0.05, and no broader than ``breadth``.
+kernel is as broad as makes the last of ``n_neighbors`` instances weigh ``min_weight``, the least that counts, and no broader
+than ``breadth``.
 """
 
 from typing import NamedTuple
@@ -11,10 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_combrel.common.compiled import compiled, inlined
-from sb3_combrel.common.constants import LAST_WEIGHT, RIDGE
+from sb3_combrel.common.constants import RIDGE
 from sb3_combrel.common.periodic import difference
 
-PER_BREADTH = -np.log(LAST_WEIGHT)
 # Sums over instances are taken in so many parts at a time, as vector registers do: in the same order on any machine.
 GROUP = 4
 # A kernel is no narrower than this part of the breadth, for the arithmetic, where all instances lie at the very same state.
@@ -25,6 +25,7 @@ class Kernel(NamedTuple):
     """What decides which instances count, and how much."""
 
     scale: float  # -1 / breadth ** 2
+    per_breadth: float  # squared distance at which an instance weighs the least that counts, in squared breadths
     reach: float  # squared distance beyond which none counts
     n_neighbors: int  # instances that a fit is made to
     outcome_breadth: float  # squared: the broadest kernel of ends (see models.ends)
@@ -79,7 +80,7 @@ def kernel_scale(fit, length, kernel):
     """The scale, -1 / breadth ** 2, of the kernel of a fit to the ``length`` nearest instances."""
     if length < kernel.n_neighbors:
         return kernel.scale
-    narrowed = -PER_BREADTH / max(fit.distance[length - 1], 1e-300)
+    narrowed = -kernel.per_breadth / max(fit.distance[length - 1], 1e-300)
     return max(min(kernel.scale, narrowed), kernel.scale / (NARROWEST * NARROWEST))
 
 

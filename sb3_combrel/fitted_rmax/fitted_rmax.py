@@ -101,8 +101,9 @@ class FittedRMax(PastData):
         for more; with ``degree=0`` 0.09, 0.15 and 0.2.
     :param min_fraction: with ``degree=0``, an instance counts while it has this fraction of the weight of the nearer ones; 0.1
         keeps at most 11 instances a pair, 0.01 (the original's) 101
-    :param min_weight: instances of less weight do not count; with the breadth it sets the kernel's reach. None: 0.05 with
-        ``degree=1``, 0.01 with ``degree=0``
+    :param min_weight: instances of less weight do not count; with the breadth it sets the kernel's reach. With ``degree=1`` a
+        fit's kernel is narrowed until the last of ``n_neighbors`` weighs this. None: 0.05 with ``degree=1``, 0.01 with
+        ``degree=0``
     :param exploration_threshold: weight of instances that makes a state-action pair known
     :param resolution: the grid has 2**resolution cells a variable; one number, or one for each variable. None: 6
         for one or two variables, 4 for three, 3 for more, finer if the breadth needs it, and coarser where there would be more

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sb3_combrel.common.constants import DISCOUNT
+from sb3_combrel.fitted_rmax.settings import DEFAULT_GAMMA
 
 LARGEST = float(np.finfo(np.float64).max)
 
@@ -51,7 +51,7 @@ class RewardRange:
         if self._gamma is not None:
             return float(self._gamma)
         never_ends = self.n_ended == 0 and self.n_truncated > 0
-        return DISCOUNT if self.largest >= 0.0 or never_ends else 1.0
+        return DEFAULT_GAMMA if self.largest >= 0.0 or never_ends else 1.0
 
     @property
     def finds_max_value(self) -> bool:
@@ -65,7 +65,7 @@ class RewardRange:
             return float(self._max_value)
         if self.largest == 0.0 and self.largest_end <= 0.0:
             # What costs nothing would keep the agent from what is unknown: nothing that it can pay is too much for that.
-            discount = self.gamma if self.gamma < 1.0 else DISCOUNT
+            discount = self.gamma if self.gamma < 1.0 else DEFAULT_GAMMA
             # As long as all rewards were 0, any value above that is the same.
             return -self.lowest / (1.0 - discount) if self.lowest < 0.0 else 1.0
         for_ever = self.largest / (1.0 - self.gamma) if self.largest > 0.0 and self.gamma < 1.0 else 0.0

@@ -16,6 +16,8 @@ from sb3_combrel.models.local_linear import LocalLinear
 DEFAULT_BREADTHS = {0: (0.09, 0.09, 0.15, 0.2), 1: (0.15, 0.15, 0.25, 0.4, 0.4, 0.5)}
 DEFAULT_NEIGHBORS = (16, 16, 24, 30, 40, 60)
 DEFAULT_MIN_WEIGHTS = {0: 0.01, 1: 0.05}
+# Where a discount is needed and none is given, as in Stable-Baselines3.
+DEFAULT_GAMMA = 0.99
 MODELS: dict[int, type[Model]] = {0: KernelAverage, 1: LocalLinear}
 MAX_NEIGHBORS = 10_000
 

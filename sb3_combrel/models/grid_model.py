@@ -83,6 +83,7 @@ class GridModel(Model):
         breadth = float(settings.model_breadth)
         self.kernel = Kernel(
             scale=-1.0 / breadth**2,
+            per_breadth=-np.log(settings.min_weight),
             reach=-np.log(settings.min_weight) * breadth**2,
             n_neighbors=settings.n_neighbors,
             outcome_breadth=min(breadth, float(settings.outcome_breadth)) ** 2,
@@ -191,7 +192,7 @@ class GridModel(Model):
     def _note(self, instance: tuple[np.ndarray, ...], action: int, widest: float, why: int) -> np.ndarray:
         """Note at the pairs of an action what has happened near them; those that are to be fitted."""
         # Where instances are transferred, what is not known is updated when its instances are twice as many.
-        rules = self.kernel.scale, self._threshold, 0 if self._giver is None else 1
+        rules = self.kernel.scale, self.kernel.per_breadth, self._threshold, 0 if self._giver is None else 1
         first = action * self.grid.n_points
         n = note_instance.call(instance, first, tuple(self.pairs), widest, why, self.grid.plain, rules, self._points)
         # The next transition writes to the same work space, and an interrupt may leave these pairs to be fitted after it.

@@ -7,7 +7,6 @@ import numpy as np
 from sb3_combrel.common.compiled import entry_point, inlined
 from sb3_combrel.common.constants import MAX_SURPRISE, SHARE_OF_LIST
 from sb3_combrel.common.periodic import difference
-from sb3_combrel.common.regression import PER_BREADTH
 from sb3_combrel.planning.grid import GridArrays, grid_coordinate, next_row, unit_of_line
 
 ROUNDING = 1e-12
@@ -66,7 +65,7 @@ CAME, WENT, ENDED = range(3)
 
 
 @inlined
-def surprise_of(pair, distance, pairs, numbers, state, at, grid, size, predicted):
+def surprise_of(pair, distance, pairs, numbers, state, at, grid, size, per_breadth, predicted):
     """By how much an instance may change what a pair predicts, in parts of the mean size of the action's numbers."""
     for v in range(len(numbers)):
         predicted[v] = pairs.fit[pair, 0, v]
@@ -77,14 +76,14 @@ def surprise_of(pair, distance, pairs, numbers, state, at, grid, size, predicted
     worst = 0.0
     for v in range(len(numbers)):
         worst = max(worst, abs(numbers[v] - predicted[v]) / size[v])
-    return worst * np.exp(-PER_BREADTH * distance / pairs.reach[pair]) / max(1.0, SHARE_OF_LIST * pairs.length[pair])
+    return worst * np.exp(-per_breadth * distance / pairs.reach[pair]) / max(1.0, SHARE_OF_LIST * pairs.length[pair])
 
 
 @inlined
 def look_at(pair, distance, widest, why, pairs, instance, at, grid, rules, predicted):
     """Note at one pair what has happened near it; whether it is to be fitted at once."""
     state, numbers, size = instance
-    scale, threshold, few = rules
+    scale, per_breadth, threshold, few = rules
     if why != ENDED and distance > pairs.reach[pair] * (1.0 + ROUNDING):
         return False
     if why == WENT:
@@ -101,7 +100,7 @@ def look_at(pair, distance, widest, why, pairs, instance, at, grid, rules, predi
         return pairs.weight[pair] >= threshold * (1.0 - 1e-9) or pairs.n_new[pair] * few > pairs.length[pair]
     if pairs.fit.shape[1] == 0:
         return True
-    pairs.surprise[pair] += surprise_of(pair, distance, pairs, numbers, state, at, grid, size, predicted)
+    pairs.surprise[pair] += surprise_of(pair, distance, pairs, numbers, state, at, grid, size, per_breadth, predicted)
     return pairs.surprise[pair] > MAX_SURPRISE or pairs.n_new[pair] * 2 >= pairs.length[pair]
 
 
@@ -113,8 +112,8 @@ def note_instance(instance, first_pair, pairs, widest, why, grid, rules, scratch
     :param first_pair: of the action; plain tuples for ``pairs``, ``grid`` and ``scratch``
     :param widest: squared distance beyond which no pair is concerned
     :param why: CAME, WENT, or ENDED: then the state is where an episode ended
-    :param rules: (-1 / model_breadth ** 2, threshold, 1 if a pair that is not known is fitted when its instances are twice as
-        many, or 0: it waits until it becomes known)
+    :param rules: (``scale`` and ``per_breadth`` of Kernel, threshold, 1 if a pair that is not known is fitted when its
+        instances are twice as many, or 0: it waits until it becomes known)
     """
     pairs, grid, scratch = PairArrays(*pairs), GridArrays(*grid), PointScratch(*scratch)
     first, last, at = scratch.span[0], scratch.span[1], scratch.span[2]

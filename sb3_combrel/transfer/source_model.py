@@ -13,6 +13,7 @@ from sb3_combrel.common.regression import Kernel, LocalFit, fit_around, known_we
 
 DEFAULT_SOURCE_BREADTH = 0.2
 N_NEIGHBORS = 24
+MIN_WEIGHT = 0.05  # of an instance that counts, as by default in Fitted R-Max
 OUTCOME_BREADTH = 0.05  # rewards and ends jump from one state to the next: they are averaged over nearer instances
 
 
@@ -85,7 +86,7 @@ class SourceModel:
     """Local linear regression on the instances of a source, one model for each action.
 
     The effect at a state is fitted, as a linear function of the state, to the ``N_NEIGHBORS`` nearest instances of the
-    action, with the kernel exp(-d^2 / breadth^2), narrowed where they lie closer so that the last of them weighs 0.05; it
+    action, with the kernel exp(-d^2 / breadth^2), narrowed where they lie closer so that the last weighs ``MIN_WEIGHT``; it
     stays within the range of theirs. Rewards and ends are averages with a kernel of ``OUTCOME_BREADTH``. Far from
     all instances the nearest ones still predict, with a small weight.
 
@@ -97,7 +98,7 @@ class SourceModel:
     def __init__(self, instances: Instances, breadth: float):
         d = instances.state.shape[2]
         self.n_variables, self.instances = d, instances
-        self.kernel = Kernel(-1.0 / breadth**2, np.inf, N_NEIGHBORS, min(breadth, OUTCOME_BREADTH) ** 2)
+        self.kernel = Kernel(-1.0 / breadth**2, -np.log(MIN_WEIGHT), np.inf, N_NEIGHBORS, min(breadth, OUTCOME_BREADTH) ** 2)
         #: For compiled code, see :func:`source_arrays`.
         self.plain = tuple(instances), tuple(self.kernel), tuple(LocalFit.empty(N_NEIGHBORS, d)), np.zeros(d)
 

@@ -11,11 +11,9 @@ from sb3_combrel.planning.planner import Planner
 from sb3_combrel.planning.q_values import Prediction, QValues, ValueFunction
 from sb3_combrel.sources.source_instances import SourceInstances
 from sb3_combrel.transfer.candidates import stacked_instances
-from sb3_combrel.transfer.source_model import SourceModel
+from sb3_combrel.transfer.source_model import MIN_WEIGHT, SourceModel
 
-MIN_WEIGHT = 1.0  # weight of instances from which on a prediction counts, as by default in Fitted R-Max
-# What the grid's resolution is chosen for: the least weight of an instance that reaches a grid point.
-LEAST_WEIGHT_ON_GRID = 0.05
+THRESHOLD = 1.0  # weight of instances from which on a prediction counts, as by default in Fitted R-Max
 _TOLERANCE = 0.001  # changes of value up to this part of the range of a step's rewards end the planning
 
 
@@ -27,7 +25,7 @@ def plan_source(
     :param min_weight: pairs with less data are optimistic; ``bounds``: the least and the largest value
     """
     model = SourceModel(stacked_instances([source]), breadth)
-    grid = fitting_grid(source.n_variables, source.n_actions, None, breadth, LEAST_WEIGHT_ON_GRID, source.periodic)
+    grid = fitting_grid(source.n_variables, source.n_actions, None, breadth, MIN_WEIGHT, source.periodic)
     mdp = FiniteMDP(grid, source.n_actions, gamma)
     n_points, cells = grid.n_points, grid.arrays.cells
     states = np.tile(grid.points(), (mdp.n_actions, 1))
@@ -64,7 +62,7 @@ class SourcePolicy:
     def __init__(self, source: SourceInstances, gamma: float, breadth: float):
         lowest, highest = float(source.rewards.min()), float(source.rewards.max())
         bounds = min(0.0, lowest) / (1.0 - gamma), max(0.0, highest) / (1.0 - gamma)
-        self.model, planner = plan_source(source, gamma, breadth, MIN_WEIGHT, bounds)
+        self.model, planner = plan_source(source, gamma, breadth, THRESHOLD, bounds)
         self.values = planner.cautious_values(SWEEPS_AT_EPISODE_END)  #: value of each grid point
         self.grid = planner.mdp.grid
         n, d = source.n_actions, source.n_variables
@@ -74,7 +72,7 @@ class SourcePolicy:
     def q_values(self, state: np.ndarray) -> np.ndarray:
         """Action values at a state of the source, unit coordinates; -inf for actions with too few instances near it."""
         found = self.model.predict(np.repeat(state[None], len(self._actions), axis=0), self._actions)
-        modelled = found.weight >= MIN_WEIGHT
+        modelled = found.weight >= THRESHOLD
         successors = (1.0 - found.end)[:, None], found.effect[:, None]
         self._q.compute(Prediction(modelled, found.weight, found.reward, self._length, *successors), state, self._function)
         return np.where(modelled, self._q.q, -np.inf)

@@ -38,11 +38,12 @@ def some_instances(seed, d, n, ends):
 
 
 @repeatable
-@given(problems, st.sampled_from([0.0, 0.3, 1.0]), st.sampled_from([0.1, 0.3, 0.8]))
-def test_a_fit_is_that_of_least_squares_to_the_nearest_instances_within_reach(problem, ends, breadth):
+@given(problems, st.sampled_from([0.0, 0.3, 1.0]), st.sampled_from([0.1, 0.3, 0.8]), st.sampled_from([0.05, 0.01, 0.3]))
+def test_a_fit_is_that_of_least_squares_to_the_nearest_instances_within_reach(problem, ends, breadth, least):
     seed, d, n, n_neighbors = problem
     instances, rng = some_instances(seed, d, n, ends), np.random.default_rng(seed + 1)
-    kernel, fit = Kernel(-1.0 / breadth**2, 3.0 * breadth**2, n_neighbors, 0.01), LocalFit.empty(n_neighbors, d)
+    kernel = Kernel(-1.0 / breadth**2, -np.log(least), 3.0 * breadth**2, n_neighbors, 0.01)
+    fit = LocalFit.empty(n_neighbors, d)
     for at in [*rng.uniform(-0.1, 1.1, (2, d)), instances.state[0, 0].copy()]:
         away, found = rng.normal(0.0, 0.1, d), np.empty(d + 1)
         length, weight = fit_and_predict(at, 0, instances, kernel, fit, away, found)
@@ -56,7 +57,7 @@ def test_a_fit_is_that_of_least_squares_to_the_nearest_instances_within_reach(pr
         np.testing.assert_allclose(squared[fit.item[:length]], squared[nearest], rtol=1e-12)
         numbers = np.column_stack([instances.effect[0], instances.reward[0]])[nearest]
         some = apart[nearest], squared[nearest], numbers, instances.terminated[0, nearest]
-        expected = Fit(*some, breadth, n_neighbors, prior=np.zeros((2, d)))
+        expected = Fit(*some, breadth, n_neighbors, least, prior=np.zeros((2, d)))
         np.testing.assert_allclose(found, expected.at(away), rtol=1e-8, atol=1e-9)
         np.testing.assert_allclose(fit.solution[0, :-1], expected.mean, rtol=1e-8, atol=1e-9)
 
@@ -65,7 +66,7 @@ def test_predicted_numbers_stay_within_the_range_of_the_instances_and_ends_do_no
     states = np.linspace(0.0, 0.3, 4)[:, None]
     ended = np.array([False, False, False, True])
     instances = Instances.of_rows(1, np.zeros(4, dtype=int), states, states.copy(), np.array([-1.0, -1.0, -1.0, 100.0]), ended)
-    kernel, fit, found = Kernel(-4.0, 1.0, 10, 0.01), LocalFit.empty(10, 1), np.empty(2)
+    kernel, fit, found = Kernel(-4.0, 3.0, 1.0, 10, 0.01), LocalFit.empty(10, 1), np.empty(2)
     for away, expected in ((0.0, 0.15), (0.1, 0.25), (5.0, 0.3), (-5.0, 0.0)):
         fit_and_predict(np.array([0.15]), 0, instances, kernel, fit, np.array([away]), found)
         np.testing.assert_allclose(found, [expected, -1.0], atol=2e-3)

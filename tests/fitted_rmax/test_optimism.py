@@ -6,7 +6,7 @@ from helpers.agents import make_agent
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sb3_combrel.fitted_rmax.optimism import DISCOUNT, RewardRange
+from sb3_combrel.fitted_rmax.optimism import DEFAULT_GAMMA, RewardRange
 
 SIZES = st.floats(1e-3, 1e3)
 REWARDS = st.floats(-1e3, 1e3)
@@ -31,7 +31,7 @@ def test_where_every_step_costs_and_episodes_end_nothing_is_discounted(costs, at
 @given(st.lists(SIZES, min_size=1, max_size=8))
 def test_where_no_episode_ends_but_by_its_time_limit_the_future_is_discounted(costs):
     steps = [(-cost, False) for cost in costs]
-    assert after(steps).gamma == 1.0 and after(steps, n_truncated=1).gamma == DISCOUNT
+    assert after(steps).gamma == 1.0 and after(steps, n_truncated=1).gamma == DEFAULT_GAMMA
     assert after([*steps, (0.0, True)], n_truncated=1).gamma == 1.0
     assert after(steps, n_truncated=1).max_value == 0.0
 
@@ -40,16 +40,16 @@ def test_where_no_episode_ends_but_by_its_time_limit_the_future_is_discounted(co
 def test_what_is_paid_at_every_step_may_be_collected_for_ever(steps, reward, at_end):
     rewards = after([*steps, (reward, False), (at_end, True)])
     paid, ends = (max(r for r, t in [*steps, (reward, False), (at_end, True)] if t == of) for of in (False, True))
-    assert rewards.gamma == DISCOUNT
-    assert rewards.max_value == pytest.approx(max(paid / (1.0 - DISCOUNT), ends))
+    assert rewards.gamma == DEFAULT_GAMMA
+    assert rewards.max_value == pytest.approx(max(paid / (1.0 - DEFAULT_GAMMA), ends))
 
 
 @given(st.lists(SIZES, max_size=6), st.lists(st.floats(-1e3, 0.0), max_size=3))
 def test_where_the_most_is_nothing_the_unknown_is_worth_what_the_worst_costs_for_ever(costs, ends):
     rewards = after([(0.0, False), *((-cost, False) for cost in costs), *((end, True) for end in ends)])
     worst = max([*costs, *(-end for end in ends), 0.0])
-    assert rewards.gamma == DISCOUNT
-    assert rewards.max_value == pytest.approx(worst / (1.0 - DISCOUNT) if worst > 0.0 else 1.0)
+    assert rewards.gamma == DEFAULT_GAMMA
+    assert rewards.max_value == pytest.approx(worst / (1.0 - DEFAULT_GAMMA) if worst > 0.0 else 1.0)
     assert rewards.max_value > 0.0, "more than what costs nothing, or nothing would draw the agent on"
     undiscounted = after([(0.0, False), *((-cost, False) for cost in costs), *((end, True) for end in ends)], gamma=1.0)
     assert undiscounted.max_value == rewards.max_value
@@ -91,8 +91,9 @@ def test_an_agent_follows_the_rewards_that_it_sees():
     here, there = np.array([0.3]), np.array([0.4])
     optimum = {agent.q_values(here)[0]}
     for reward, terminated, max_value, gamma in [
-        *[(-1.0, False, 0.0, 1.0), (5.0, True, 5.0, 1.0), (0.0, False, 5.0, DISCOUNT), (2.0, False, 200.0, DISCOUNT)],
-        (0.5, False, 200.0, DISCOUNT),
+        *[(-1.0, False, 0.0, 1.0), (5.0, True, 5.0, 1.0), (0.0, False, 5.0, DEFAULT_GAMMA)],
+        (2.0, False, 200.0, DEFAULT_GAMMA),
+        (0.5, False, 200.0, DEFAULT_GAMMA),
     ]:
         agent.update(here, 0, reward, there, terminated)
         assert agent.planner.bounds[1] == pytest.approx(max_value) and agent.mdp.gamma == gamma
@@ -112,5 +113,5 @@ def test_an_agent_whose_episodes_reach_their_time_limit_discounts():
     assert agent.mdp.gamma == 1.0
     for _ in range(3):
         agent.end_episode(truncated=True)
-    assert agent.mdp.gamma == DISCOUNT
-    assert agent.q_values(np.array([0.5]))[0] == pytest.approx(-1.0 / (1.0 - DISCOUNT), rel=0.01)
+    assert agent.mdp.gamma == DEFAULT_GAMMA
+    assert agent.q_values(np.array([0.5]))[0] == pytest.approx(-1.0 / (1.0 - DEFAULT_GAMMA), rel=0.01)

@@ -11,7 +11,7 @@ import numpy as np
 from helpers.naive_fitted_rmax import Instance, NaiveGrid, apart
 
 # Figures of the definition, as the documentation states them.
-LAST_WEIGHT, NARROWEST, RIDGE = 0.05, 1e-6, 0.001
+NARROWEST, RIDGE = 1e-6, 0.001
 ON_GRID, MAX_STEPS = 0.5, 50
 # Arrivals farther than so many squared breadths beyond the nearest do not count; this is what the nearest adds to a breadth.
 NEGLIGIBLE, ROUNDING = 9.0, 1e-7
@@ -39,17 +39,17 @@ def ridge_regression(weights, z, numbers, ridge=RIDGE):
 class Fit:
     """Effects, then the reward, as linear functions around a state, within the range of the instances."""
 
-    def __init__(self, away, squared, numbers, ended, breadth, n_neighbors, prior):
+    def __init__(self, away, squared, numbers, ended, breadth, n_neighbors, min_weight, prior):
         """The instances come nearest first.
 
         :param away: shape (n, d): where they are, seen from the state; ``squared``: their squared distances
         :param numbers: shape (n, d + 1); or (n, d + 2), whether they ended an episode last, if the action decides that
-        :param breadth: of the broad kernel
+        :param breadth: of the broad kernel; ``min_weight``: of the last of ``n_neighbors`` instances
         :param prior: effects, shape (d,), and as how many instances at the state they count, the same
         """
         broad = breadth
         if len(squared) == n_neighbors:
-            breadth = min(breadth, max(NARROWEST * breadth, math.sqrt(squared[-1] / -math.log(LAST_WEIGHT))))
+            breadth = min(breadth, max(NARROWEST * breadth, math.sqrt(squared[-1] / -math.log(min_weight))))
         weights = np.exp((squared[0] - squared) / breadth**2)
         going_on = ~ended if not ended.all() else ended
         numbers, d = numbers.copy(), away.shape[1]
@@ -94,10 +94,10 @@ class NaiveLocalLinear:
         self.grid = NaiveGrid(*grid)
         self.points = [self.grid.unit(point) for point in range(len(self.grid.coordinates))]
         self.n_points, self.n_actions, self.d = len(self.points), n_actions, len(grid[0])
-        self.breadth, self.n_neighbors = kernel["breadth"], kernel["n_neighbors"]
+        self.breadth, self.n_neighbors, self.min_weight = kernel["breadth"], kernel["n_neighbors"], kernel["min_weight"]
         self.ends_by_action = kernel.get("ends_by_action", False)
         self.outcome_breadth = min(self.breadth, kernel["outcome_breadth"]) ** 2
-        self.reach = -math.log(kernel["min_weight"]) * self.breadth**2
+        self.reach = -math.log(self.min_weight) * self.breadth**2
         self.threshold, self.max_instances = threshold, max_instances
         self.prior = (lambda state, action: (np.zeros(self.d), np.zeros(self.d))) if prior is None else prior
         self.transitions = []
@@ -151,7 +151,7 @@ class NaiveLocalLinear:
         numbers = [[*i.effect, i.reward, *([float(i.terminated)] if self.ends_by_action else [])] for i in instances]
         ended = np.array([i.terminated for i in instances])
         prior = self.prior_at(at, action)
-        fit = Fit(away, squared, np.array(numbers), ended, self.breadth, self.n_neighbors, prior)
+        fit = Fit(away, squared, np.array(numbers), ended, self.breadth, self.n_neighbors, self.min_weight, prior)
         return fit, np.exp(-squared / self.breadth**2).sum()
 
     def end_at(self, at, now):
