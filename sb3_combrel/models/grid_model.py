@@ -80,11 +80,11 @@ class GridModel(Model):
         super().__init__(mdp, settings, transfer)
         is_prior = self.takes_prior and transfer is not None and transfer.use == "prior"
         self._prior = transfer if is_prior else None
-        breadth = float(settings.model_breadth)
+        breadth, per_breadth = float(settings.model_breadth), -np.log(settings.min_weight)
         self.kernel = Kernel(
             scale=-1.0 / breadth**2,
-            per_breadth=-np.log(settings.min_weight),
-            reach=-np.log(settings.min_weight) * breadth**2,
+            per_breadth=per_breadth,
+            reach=per_breadth * breadth**2,
             n_neighbors=settings.n_neighbors,
             outcome_breadth=min(breadth, float(settings.outcome_breadth)) ** 2,
         )

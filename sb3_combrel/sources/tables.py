@@ -206,12 +206,13 @@ def _follow(frame: pd.DataFrame) -> NDArray[np.bool_]:
         follows = np.asarray(index.droplevel(-1)[1:] == index.droplevel(-1)[:-1], dtype=np.bool_)
     # Times as numbers; of text, no number.
     places = np.asarray(pd.to_numeric(index.get_level_values(-1), errors="coerce"), dtype=np.float64)
-    if index.nlevels > 1 and not np.isfinite(places).all():
+    no_numbers = np.flatnonzero(~np.isfinite(places))
+    if len(no_numbers) and index.nlevels > 1:
         raise ValueError(
             "the last level of the table's index must be numbers or times, which say which rows follow each other, got "
-            f"{index.get_level_values(-1)[0]!r}: pandas.to_datetime makes times of text"
+            f"{index.get_level_values(-1)[no_numbers[0]]!r}: pandas.to_datetime makes times of text"
         )
-    if not follows.any() or not np.isfinite(places).all():
+    if len(no_numbers) or not follows.any():
         return follows
     apart, n_together = np.diff(places), follows.sum()
     follows &= (apart > 0.0) & (apart < 1.5 * np.median(apart[follows]))
